@@ -1,0 +1,82 @@
+"""A process that runs modules on a shared store: `python -m autonomy.process`, its job as JSON on standard input.
+
+It attaches to the cart's store alone. It is a participant: the clock waits for it, as long as it lives.
+"""
+
+import json
+import logging
+import subprocess
+import sys
+from typing import Any
+
+from rtdb import RtdbError, Store
+
+from .host import Host
+from .module import ModuleError
+from .wiring import Wire
+
+CONNECT_S = 30.0
+CLOCK_DEAD_S = 60.0
+
+
+def spawn(store_name: str, wires: tuple[Wire, ...], seed: int) -> "subprocess.Popen[str]":
+    """Start a process for some modules of a stack. It ends by itself when the store is closed."""
+    job = {
+        "store": store_name,
+        "seed": seed,
+        "wires": [
+            {
+                "component": w.component,
+                "module": w.module,
+                "every": w.every,
+                "phase": w.phase,
+                "inputs": w.inputs,
+                "params": w.params,
+            }
+            for w in wires
+        ],
+    }
+    child = subprocess.Popen([sys.executable, "-m", "autonomy.process"], stdin=subprocess.PIPE, text=True)
+    assert child.stdin is not None
+    child.stdin.write(json.dumps(job) + "\n")
+    child.stdin.flush()  # it stays open: its end tells the child that we are gone
+    return child
+
+
+def run(job: dict[str, Any]) -> None:
+    """Host the modules of a job until the clock stops for good."""
+    with Store.attach(job["store"]) as store:
+        hosts = [Host(store, Wire(**wire), job["seed"], participant=True) for wire in job["wires"]]
+        for host in hosts:
+            host.connect(CONNECT_S)
+        cycle = store.cycle
+        for host in hosts:
+            host.component.done(cycle)
+        while True:
+            now = store.wait_cycle(cycle, 1.0)
+            if now is None:
+                if not any(c.name == "clock" and c.alive for c in store.components()):
+                    return
+                continue
+            for due in range(cycle + 1, now + 1):
+                for host in hosts:
+                    host.step(due)
+                    host.component.done(due)
+            cycle = now
+
+
+def main() -> int:
+    """Read the job and run it; exit 1 with one line for a module that cannot run."""
+    logging.basicConfig(format="%(message)s", level=logging.ERROR)
+    try:
+        run(json.loads(sys.stdin.readline()))
+    except (ModuleError, RtdbError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

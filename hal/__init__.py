@@ -1,0 +1,1 @@
+"""Hardware abstraction: the signals that every package shares, codecs, drivers and device models of the cart."""

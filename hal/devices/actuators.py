@@ -1,0 +1,220 @@
+"""Device models of the steering, brake and drive nodes: sans-I/O, polled at base ticks.
+
+Each obeys its command only while the safety node reports ENABLED, its own command is not silent and the command's
+enable bit rose after idle frames. Otherwise steering holds its angle, the drive gives nothing, and the brake ramps up.
+"""
+
+import math
+
+from hal.bus import CanBus, CanPort, Received
+from hal.codecs.cartcan import (
+    BrakeCmd,
+    BrakeRpt,
+    Direction,
+    Estop,
+    Message,
+    SteerCmd,
+    SteerMode,
+    SteerRpt,
+    SystemRpt,
+    ThrottleCmd,
+    ThrottleMode,
+    ThrottleRpt,
+)
+from hal.signals import SystemState
+
+from .watch import GOOD_BEFORE_ENABLE, CommandWatch
+
+COMMAND_TIMEOUT_NS = 100_000_000
+SAFETY_TIMEOUT_NS = 250_000_000
+REPORT_NS = 20_000_000
+
+
+class Node:
+    """What the three actuator nodes share: listening, permission to act, the time of the next report."""
+
+    command: type[Message]
+
+    def __init__(self, bus: CanBus, name: str) -> None:
+        self.port: CanPort = bus.port(name, [self.command, SystemRpt, Estop])
+        self.watch = CommandWatch(COMMAND_TIMEOUT_NS)
+        self.state = SystemState.INIT
+        self.estop = False
+        self.enabled = False
+        self._armed = False  # enough idle frames came before the enable bit
+        self._safety_ns: int | None = None
+        self._asked: Message | None = None
+
+    def _listen(self, t_ns: int) -> None:
+        for received in self.port.receive():
+            if received.frame_id == self.command.ID:
+                self._obey(received)
+            elif isinstance(received.message, SystemRpt):
+                self.state, self._safety_ns = SystemState(received.message.state), received.t_ns
+            elif isinstance(received.message, Estop):
+                self.estop = bool(received.message.active)
+        asked = self._asked is not None and bool(getattr(self._asked, "enable", 0))
+        watched = self._safety_ns is not None and t_ns - self._safety_ns <= SAFETY_TIMEOUT_NS
+        was, self.enabled = (
+            self.enabled,
+            (
+                asked
+                and self._armed
+                and watched
+                and self.state is SystemState.ENABLED
+                and not self.estop
+                and not self.watch.silent(t_ns)
+                and not self.watch.tripped
+            ),
+        )
+        self._armed = self._armed and (asked or not was)
+        if self.state is SystemState.READY and not asked:
+            self.watch.forgive()
+
+    def _obey(self, received: Received) -> None:
+        idle = self.watch.idle_streak
+        message = self.watch.judge(received)
+        if message is not None:
+            if getattr(message, "enable", 0) and idle >= GOOD_BEFORE_ENABLE:
+                self._armed = True
+            self._asked = message
+
+    def _take_rejected(self) -> bool:
+        rejected, self.watch.rejected = self.watch.rejected, False
+        return rejected
+
+
+class SteerNode(Node):
+    """Steering: a position servo. `target_rad` is what it asks of the mechanism."""
+
+    command = SteerCmd
+
+    def __init__(self, bus: CanBus) -> None:
+        super().__init__(bus, "STEER")
+        self.target_rad = 0.0
+
+    def poll(self, t_ns: int, angle_rad: float, driver_torque_nm: float) -> None:
+        """Act on what came; report when due."""
+        was = self.enabled
+        self._listen(t_ns)
+        if self.state is SystemState.OVERRIDE or (self.enabled and not was):
+            self.target_rad = angle_rad  # released, or: nothing jumps on entry
+        if self.enabled and isinstance(self._asked, SteerCmd) and self._asked.mode == SteerMode.ANGLE:
+            self.target_rad = self._asked.angle_rad
+        if t_ns % REPORT_NS == 0:
+            self.port.send(
+                SteerRpt.of(
+                    angle_rad=angle_rad,
+                    angle_cmd_rad=self.target_rad,
+                    driver_torque_nm=driver_torque_nm,
+                    enabled=self.enabled,
+                    override=self.state is SystemState.OVERRIDE,
+                    timeout=self.watch.silent(t_ns),
+                    homed=True,
+                    cmd_rejected=self._take_rejected(),
+                ),
+                t_ns,
+            )
+
+
+class BrakeNode(Node):
+    """Brake: an effort servo, and the node that stops the cart when nobody else does."""
+
+    command = BrakeCmd
+
+    def __init__(self, bus: CanBus, *, stop_effort: float, park_effort: float, ramp_per_s: float = 1.0) -> None:
+        super().__init__(bus, "BRAKE")
+        self.effort = park_effort
+        self._stop_effort, self._park_effort, self._ramp_per_s = stop_effort, park_effort, ramp_per_s
+        self._polled_ns: int | None = None
+
+    def poll(self, t_ns: int, pressure: float, pedal: float) -> None:
+        """Act on what came; report when due. `pressure` is the effort that the mechanism has reached."""
+        self._listen(t_ns)
+        dt_s = 0.0 if self._polled_ns is None else (t_ns - self._polled_ns) * 1e-9
+        self._polled_ns = t_ns
+        if self.estop or self.state is SystemState.ESTOP:
+            self.effort = 1.0
+        elif self.state in (SystemState.OVERRIDE, SystemState.MANUAL):
+            self.effort = 0.0
+        elif self.enabled and isinstance(self._asked, BrakeCmd):
+            self.effort = self._asked.effort_ratio
+        elif self.state in (SystemState.INIT, SystemState.READY):
+            self.effort = self._park_effort
+        else:  # stopping or fault, or the host or the safety node fell silent
+            step = self._ramp_per_s * dt_s
+            self.effort += min(max(self._stop_effort - self.effort, -step), step)
+        if t_ns % REPORT_NS == 0:
+            self.port.send(
+                BrakeRpt.of(
+                    effort_ratio=pressure,
+                    effort_cmd_ratio=self.effort,
+                    pedal_ratio=pedal,
+                    enabled=self.enabled,
+                    override=self.state is SystemState.OVERRIDE,
+                    timeout=self.watch.silent(t_ns),
+                    cmd_rejected=self._take_rejected(),
+                ),
+                t_ns,
+            )
+
+
+class DriveNode(Node):
+    """Drive: holds a speed with its own motor encoder (proportional-integral), or gives a torque."""
+
+    command = ThrottleCmd
+    gain_per_mps = 0.5  # ours; settles in about two seconds with the lag of the drive
+    integral_per_m = 0.15
+
+    def __init__(self, bus: CanBus) -> None:
+        super().__init__(bus, "DRIVE")
+        self.output = 0.0
+        self.contactor_open = False
+        self._ramp_mps = self._integral = 0.0
+        self._polled_ns: int | None = None
+
+    def poll(self, t_ns: int, speed_mps: float, output: float, pedal: float) -> None:
+        """Act on what came; report when due. `output` is the torque that the motor gives."""
+        self._listen(t_ns)
+        dt_s = 0.0 if self._polled_ns is None else (t_ns - self._polled_ns) * 1e-9
+        self._polled_ns = t_ns
+        self.contactor_open = self.estop or self.state is SystemState.ESTOP
+        if self.enabled and isinstance(self._asked, ThrottleCmd):
+            self.output = self._drive(self._asked, speed_mps, dt_s)
+        else:
+            self.output = self._integral = 0.0
+            self._ramp_mps = speed_mps
+        if t_ns % REPORT_NS == 0:
+            direction = Direction.REVERSE if self.output < 0 else Direction.FORWARD
+            self.port.send(
+                ThrottleRpt.of(
+                    output_ratio=output,
+                    cmd_ratio=self.output,
+                    pedal_ratio=pedal,
+                    enabled=self.enabled,
+                    override=self.state is SystemState.OVERRIDE,
+                    timeout=self.watch.silent(t_ns),
+                    direction=direction,
+                    cmd_rejected=self._take_rejected(),
+                ),
+                t_ns,
+            )
+
+    def _drive(self, asked: ThrottleCmd, speed_mps: float, dt_s: float) -> float:
+        if asked.mode == ThrottleMode.PERCENT:
+            return min(max(asked.percent_ratio or 0.0, -1.0), 1.0)
+        wanted = asked.speed_mps
+        if asked.mode != ThrottleMode.SPEED or not wanted:
+            self._integral, self._ramp_mps = 0.0, speed_mps
+            return 0.0
+        rise = (asked.accel_limit_mps2 or 1.0) * dt_s
+        self._ramp_mps = (
+            min(max(wanted, self._ramp_mps - 10.0 * rise), self._ramp_mps + rise)
+            if wanted > 0
+            else max(min(wanted, self._ramp_mps + 10.0 * rise), self._ramp_mps - rise)
+        )
+        error = self._ramp_mps - speed_mps
+        self._integral = min(max(self._integral + self.integral_per_m * error * dt_s, -1.0), 1.0)
+        output = self.gain_per_mps * error + self._integral
+        low, high = (0.0, 1.0) if wanted > 0 else (-1.0, 0.0)
+        return min(max(output, low), high) if math.isfinite(output) else 0.0

@@ -1,0 +1,173 @@
+"""Driver of the cart's actuators and safety node: the host end of the CAN bus.
+
+Every 20 ms it sends the three actuator commands in one burst, every 50 ms SYSTEM_CMD, also while disabled. It enables
+once the safety node is ready and a fresh command is there; it never clears a fault by itself.
+"""
+
+from dataclasses import dataclass, field
+
+from hal.bus import CanBus
+from hal.codecs.cartcan import (
+    BrakeCmd,
+    BrakeRpt,
+    Direction,
+    SteerCmd,
+    SteerRpt,
+    SystemCmd,
+    SystemRpt,
+    ThrottleCmd,
+    ThrottleRpt,
+    WheelTicks,
+)
+from hal.limits import Envelope, limit
+from hal.signals import (
+    ActuatorCommand,
+    ActuatorState,
+    DriveCommand,
+    Limit,
+    LinkCounters,
+    Odometry,
+    SafetyState,
+    SystemState,
+)
+
+from .odometry import OdometryDriver
+
+BURST_NS = 20_000_000
+SYSTEM_NS = 50_000_000
+IDLE_BURSTS = 4  # sent disabled before enabling; the nodes want three good ones
+ACCEL_LIMIT_MPS2 = 1.0
+FULL_BRAKE_MPS2 = 5.0  # deceleration at effort 1, empty cart
+HOLD_EFFORT = 0.15
+STANDSTILL_MPS = 0.05
+
+
+def brake_effort(command: DriveCommand, speed_mps: float) -> float:
+    """Decide the brake effort [0, 1] that slows the cart from its measured speed to the commanded one."""
+    wanted, actual = abs(command.speed_mps), abs(speed_mps)
+    if wanted == 0.0 and actual < STANDSTILL_MPS:
+        return HOLD_EFFORT
+    excess_mps = actual - wanted
+    if excess_mps < 0.15 and wanted > 0.0:
+        return 0.0
+    decel_mps2 = min(command.decel_mps2, 0.3 + 2.0 * excess_mps)
+    return min(max(decel_mps2 / FULL_BRAKE_MPS2, 0.0), 1.0)
+
+
+@dataclass
+class Heard:
+    """What one poll brought, with data stamps."""
+
+    odometry: list[tuple[Odometry, int]] = field(default_factory=list)
+    safety: list[tuple[SafetyState, int]] = field(default_factory=list)
+    actuators: list[tuple[ActuatorState, int]] = field(default_factory=list)
+
+
+class CartDriver:
+    """Sans-I/O host end: `poll` reads the bus, `command` writes it."""
+
+    def __init__(self, bus: CanBus, metres_per_tick: float, envelope: Envelope | None = None) -> None:
+        self.port = bus.port("HOST", [SystemRpt, SteerRpt, BrakeRpt, ThrottleRpt, WheelTicks])
+        self.envelope = envelope or Envelope()
+        self.state = SystemState.INIT
+        self._odometry = OdometryDriver(metres_per_tick)
+        self._speed_mps = 0.0
+        self._steer: SteerRpt | None = None
+        self._brake: BrakeRpt | None = None
+        self._idle = 0
+        self._enable = False
+        self._origin_cycle = 0
+        self._received = self._lost = 0
+        self._counters: dict[int, int] = {}
+
+    def poll(self) -> Heard:
+        """Read what the nodes sent since the last poll."""
+        heard = Heard()
+        for received in self.port.receive():
+            message, t_ns = received.message, received.t_ns
+            if message is None:
+                continue
+            self._received += 1
+            last = self._counters.get(received.frame_id)
+            self._lost += 0 if last is None else (received.counter - last - 1) & 15
+            self._counters[received.frame_id] = received.counter
+            if isinstance(message, WheelTicks):
+                odometry = self._odometry.hear(message, received.counter, t_ns)
+                self._speed_mps = odometry.speed_mps
+                heard.odometry.append((odometry, t_ns))
+            elif isinstance(message, SteerRpt):
+                self._steer = message
+            elif isinstance(message, BrakeRpt):
+                self._brake = message
+            elif isinstance(message, ThrottleRpt):
+                if self._steer is not None and self._brake is not None:
+                    heard.actuators.append((actuator_state(self._steer, self._brake, message), t_ns))
+            elif isinstance(message, SystemRpt):
+                self.state = SystemState(message.state)
+                heard.safety.append((safety_state(message), t_ns))
+        return heard
+
+    @property
+    def counters(self) -> LinkCounters:
+        """Frames received, refused and missed so far."""
+        return LinkCounters(self._received, self.port.damaged, self._lost)
+
+    def command(
+        self, t_ns: int, command: DriveCommand | None, origin_ns: int, origin_cycle: int
+    ) -> ActuatorCommand | None:
+        """Send what is due at t_ns; returns what the burst asked for, None between bursts.
+
+        origin_ns, origin_cycle: when the oldest sensor data behind the command was true.
+        """
+        if t_ns % SYSTEM_NS == 0:
+            self.port.send(
+                SystemCmd.of(cycle=self._origin_cycle, request_enable=self._enable, host_state=int(self.state)), t_ns
+            )
+        if t_ns % BURST_NS != 0:
+            return None
+        drive, why = limit(command, t_ns - origin_ns, self.envelope)
+        self._origin_cycle = origin_cycle
+        self._idle = min(self._idle + 1, IDLE_BURSTS) if self.state is SystemState.READY else 0
+        ready = self._idle >= IDLE_BURSTS and why in (Limit.NONE, Limit.LATERAL)
+        obeyed = self._enable and self.state in (SystemState.READY, SystemState.ENABLED)
+        self._enable = ready or (obeyed and why not in (Limit.NO_COMMAND, Limit.STALE))
+        enable = self._enable or self.state is SystemState.ENABLED  # the brake of a stale host must still be obeyed
+        effort = brake_effort(drive, self._speed_mps)
+        direction = Direction.FORWARD if drive.speed_mps >= 0 else Direction.REVERSE
+        self.port.send(SteerCmd.of(angle_rad=drive.steer_rad, enable=enable), t_ns)
+        self.port.send(BrakeCmd.of(effort_ratio=effort, enable=enable), t_ns)
+        self.port.send(
+            ThrottleCmd.of_speed(
+                speed_mps=drive.speed_mps, accel_limit_mps2=ACCEL_LIMIT_MPS2, enable=enable, direction=direction
+            ),
+            t_ns,
+        )
+        return ActuatorCommand(drive.speed_mps, drive.steer_rad, effort, self._enable, why, origin_cycle)
+
+
+def actuator_state(steer: SteerRpt, brake: BrakeRpt, throttle: ThrottleRpt) -> ActuatorState:
+    """Join the reports of the three nodes."""
+    return ActuatorState(
+        steer_rad=steer.angle_rad or 0.0,
+        steer_command_rad=steer.angle_cmd_rad or 0.0,
+        brake=brake.effort_ratio or 0.0,
+        brake_command=brake.effort_cmd_ratio or 0.0,
+        drive=throttle.output_ratio or 0.0,
+        steer_enabled=bool(steer.enabled),
+        brake_enabled=bool(brake.enabled),
+        drive_enabled=bool(throttle.enabled),
+        rejected=bool(steer.cmd_rejected or brake.cmd_rejected or throttle.cmd_rejected),
+    )
+
+
+def safety_state(report: SystemRpt) -> SafetyState:
+    """Translate SYSTEM_RPT."""
+    return SafetyState(
+        state=SystemState(report.state),
+        estop=bool(report.estop),
+        host_timeout=bool(report.host_timeout),
+        bad_crc=bool(report.bad_crc),
+        bad_counter=bool(report.bad_counter),
+        override=bool(report.override_steer or report.override_brake or report.override_throttle),
+        fault_code=report.fault_code,
+    )

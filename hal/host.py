@@ -1,0 +1,82 @@
+"""Runs the drivers on a store: what devices say becomes objects, the drive command goes out to the nodes.
+
+Objects: gps/fix, odometry/travel, safety/state, actuators/state, actuators/command, and counters of each transport.
+All are visible at the tick after the one at which they were heard.
+"""
+
+from rtdb import HOST_DEPENDENT, Object, Store
+
+from .bus import CanBus
+from .drivers.cart import CartDriver
+from .drivers.gps import GpsDriver
+from .limits import Envelope
+from .serial_line import SerialDevice, carry
+from .signals import (
+    ActuatorCommand,
+    ActuatorState,
+    DriveCommand,
+    GpsFix,
+    LinkCounters,
+    Odometry,
+    SafetyState,
+)
+
+COUNTERS_NS = 1_000_000_000
+METRES_PER_TICK = 1.40 / 128  # wheel circumference over edges a turn
+
+
+class GpsHost:
+    """The GPS driver on a store."""
+
+    def __init__(self, store: Store, driver: GpsDriver, device: SerialDevice | None = None) -> None:
+        gps = store.join("gps")
+        self.driver, self._device = driver, device
+        self._fix = gps.insert("fix", GpsFix, history_s=1.0)
+        self._counters = gps.insert("counters", LinkCounters, every=10, flags=HOST_DEPENDENT, history_s=2.0)
+
+    def step(self, t_ns: int) -> None:
+        """Read the line; commit finished epochs."""
+        if self._device is not None:
+            carry(self._device, self.driver, t_ns)
+        for fix, t_data_ns in self.driver.poll(t_ns):
+            self._fix.write(fix, t_data_ns)
+        if t_ns % COUNTERS_NS == 0:
+            self._counters.write(self.driver.counters, t_ns)
+
+
+class CartHost:
+    """The cart's drivers on a store."""
+
+    def __init__(self, store: Store, bus: CanBus, envelope: Envelope | None = None) -> None:
+        self._store = store
+        self.driver = CartDriver(bus, METRES_PER_TICK, envelope)
+        self._travel = store.join("odometry").insert("travel", Odometry)
+        self._safety = store.join("safety").insert("state", SafetyState)
+        actuators = store.join("actuators")
+        self._state = actuators.insert("state", ActuatorState)
+        self._command = actuators.insert("command", ActuatorCommand, n_causes=1)
+        self._counters = actuators.insert("counters", LinkCounters, every=10, flags=HOST_DEPENDENT)
+        self._drive: Object[DriveCommand] | None = None
+
+    def obey(self, drive: Object[DriveCommand]) -> None:
+        """Take commands from an object. Call it while disabled only."""
+        self._drive = drive
+
+    def step(self, cycle: int, t_ns: int) -> None:
+        """Read the bus, commit what was heard, send what is due."""
+        heard = self.driver.poll()
+        for odometry, t_data_ns in heard.odometry:
+            self._travel.write(odometry, t_data_ns)
+        for safety, t_data_ns in heard.safety:
+            self._safety.write(safety, t_data_ns)
+        for actuators, t_data_ns in heard.actuators:
+            self._state.write(actuators, t_data_ns)
+        sample = self._drive.visible(cycle) if self._drive is not None else None
+        origin_ns = sample.t_data_ns if sample is not None else t_ns
+        origin_cycle = (origin_ns - self._store.t0_ns) // self._store.tick_ns
+        sent = self.driver.command(t_ns, sample.value if sample is not None else None, origin_ns, origin_cycle)
+        if sent is not None:
+            causes = ((self._drive.oid, sample.write),) if sample is not None and self._drive is not None else ()
+            self._command.write(sent, origin_ns, causes)
+        if t_ns % COUNTERS_NS == 0:
+            self._counters.write(self.driver.counters, t_ns)

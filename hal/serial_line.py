@@ -1,0 +1,25 @@
+"""A serial line inside one process: what the device sent by a time, the driver reads at that time."""
+
+from typing import Any, Protocol
+
+from .drivers.gps import GpsDriver
+
+
+class SerialDevice(Protocol):
+    """A simulated device at the far end: bytes at level wire, decoded messages at level direct."""
+
+    silent: bool
+
+    def poll(self, t_ns: int) -> Any:
+        """Give what has left the device since the last poll."""
+
+
+def carry(device: SerialDevice, driver: GpsDriver, t_ns: int) -> None:
+    """Move what has arrived by t_ns."""
+    sent = device.poll(t_ns)
+    if isinstance(sent, bytes):
+        if sent:
+            driver.feed(sent, t_ns)
+    else:
+        for message in sent:
+            driver.hear(message, t_ns)

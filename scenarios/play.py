@@ -1,0 +1,1 @@
+"""Play: a capture of a real GPS receiver through transport, driver, database and localiser, unchanged."""

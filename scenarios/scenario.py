@@ -1,0 +1,230 @@
+"""Scenario files: YAML that people write, checked by pydantic; an error names file, line and key."""
+
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from sim.site import SITES, Site, site_names
+
+from .judge import Criterion
+
+LIBRARY = Path(__file__).with_name("library")
+STACKS = Path(__file__).parent.parent / "autonomy" / "stacks"
+SUFFIX = ".scenario.yaml"
+M = TypeVar("M", bound=BaseModel)
+
+
+class ScenarioError(ValueError):
+    """A scenario, or a file that it needs, is missing or wrong."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class StartPoint(_Strict):
+    """Start mark of C, and how well the crew puts the cart there."""
+
+    east_m: float = 0.0
+    north_m: float = 0.0
+    yaw_deg: float = 0.0
+    position_sigma_m: float = Field(default=0.2, ge=0.0, le=2.0)
+    yaw_sigma_deg: float = Field(default=2.0, ge=0.0, le=45.0)
+
+
+class Waypoint(_Strict):
+    """A GPS coordinate with a target radius; for sites without a survey, metres from the site's origin."""
+
+    lat_deg: float | None = Field(None, ge=-90, le=90)
+    lon_deg: float | None = Field(None, ge=-180, le=180)
+    east_m: float | None = None
+    north_m: float | None = None
+    radius_m: float = Field(3.0, gt=0.0, le=20.0)
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "Waypoint":
+        geo, local = (self.lat_deg, self.lon_deg), (self.east_m, self.north_m)
+        if not ((None not in geo and local == (None, None)) or (None not in local and geo == (None, None))):
+            raise ValueError("a way-point has lat_deg and lon_deg, or east_m and north_m")
+        return self
+
+
+class CoursePlan(_Strict):
+    """What to drive."""
+
+    speed_mps: float = Field(gt=0.0, le=5.5)
+    waypoints: tuple[Waypoint, ...] = Field(min_length=1, max_length=64)
+
+
+class GpsSetup(_Strict):
+    """The GPS receiver of this drive."""
+
+    grade: Literal["autonomous", "sbas", "rtk_float", "rtk_fixed"] = "sbas"
+
+
+class HostSilenceFault(_Strict):
+    """The host's CAN frames stop."""
+
+    kind: Literal["host-silence"]
+    at_s: float = Field(gt=0.0)
+
+
+class GpsOutageFault(_Strict):
+    """The receiver has no fix for a while."""
+
+    kind: Literal["gps-outage"]
+    at_s: float = Field(ge=0.0)
+    for_s: float = Field(gt=0.0)
+
+
+FaultSetup = Annotated[HostSilenceFault | GpsOutageFault, Field(discriminator="kind")]
+
+
+class Scenario(_Strict):
+    """A drive: world, start, stack, faults, criteria."""
+
+    id: str = Field(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*(/[a-z0-9]+(-[a-z0-9]+)*)*$")
+    about: str
+    site: str
+    start_utc: datetime = datetime(2026, 11, 22, 15, 0, tzinfo=UTC)
+    start: StartPoint = StartPoint()
+    course: CoursePlan
+    stack: str = "reference"
+    gps: GpsSetup = GpsSetup()
+    faults: tuple[FaultSetup, ...] = ()
+    duration_s: float = Field(gt=0.0, le=3600.0)
+    seeds: int = Field(1, ge=1, le=10_000)
+    tags: tuple[str, ...] = ()
+    criteria: dict[str, str] = Field(min_length=1)
+
+    @field_validator("site")
+    @classmethod
+    def _known_site(cls, name: str) -> str:
+        if name not in site_names():
+            raise ValueError(f"there is no site {name!r}; there are {', '.join(site_names())}")
+        return name
+
+    @field_validator("start_utc")
+    @classmethod
+    def _whole_second(cls, t: datetime) -> datetime:
+        if t.tzinfo is None:
+            t = t.replace(tzinfo=UTC)
+        if t.microsecond or t.year < 1980:
+            raise ValueError("start_utc is a whole second, not before 1980")
+        return t
+
+    @field_validator("criteria")
+    @classmethod
+    def _criteria(cls, raw: dict[str, str]) -> dict[str, str]:
+        for metric, text in raw.items():
+            Criterion.parse(metric, text)
+        return raw
+
+    @property
+    def parsed_criteria(self) -> tuple[Criterion, ...]:
+        """The criteria, ready to judge."""
+        return tuple(Criterion.parse(metric, text) for metric, text in self.criteria.items())
+
+    @property
+    def t0_ns(self) -> int:
+        """Start time, ns since 1970."""
+        return int(self.start_utc.timestamp()) * 1_000_000_000
+
+    def load_site(self) -> Site:
+        """Read the site file."""
+        return load_yaml(SITES / f"{self.site}.yaml", Site)
+
+    def stack_path(self) -> Path:
+        """Where the stack's wiring is: a name of a shipped one, or a path."""
+        return Path(self.stack) if self.stack.endswith(".json") else STACKS / f"{self.stack}.json"
+
+    def waypoints_geo(self, site: Site) -> list[tuple[float, float, float]]:
+        """Way-points as (lat_rad, lon_rad, radius_m)."""
+        out = []
+        for w in self.course.waypoints:
+            if w.lat_deg is not None and w.lon_deg is not None:
+                out.append((math.radians(w.lat_deg), math.radians(w.lon_deg), w.radius_m))
+            else:
+                out.append((*site.plane.to_geo(w.east_m or 0.0, w.north_m or 0.0), w.radius_m))
+        return out
+
+
+def library() -> dict[str, Path]:
+    """List the scenarios that ship, by id."""
+    return {str(p.relative_to(LIBRARY)).removesuffix(SUFFIX): p for p in sorted(LIBRARY.rglob(f"*{SUFFIX}"))}
+
+
+def load_scenario(name: str) -> Scenario:
+    """Load a scenario by id from the library, or by path."""
+    path = Path(name) if name.endswith((".yaml", ".yml")) else library().get(name)
+    if path is None:
+        import difflib
+
+        near = difflib.get_close_matches(name, library(), n=1)
+        hint = f"; did you mean {near[0]}?" if near else f"; there are {', '.join(library())}"
+        raise ScenarioError(f"no scenario {name!r}{hint}")
+    return load_yaml(path, Scenario)
+
+
+def load_yaml(path: Path, model: type[M]) -> M:
+    """Read a YAML file into a model; ScenarioError names file, line and key."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+    try:
+        data = YAML(typ="rt").load(path)
+    except FileNotFoundError as error:
+        raise ScenarioError(f"no file {path}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: cannot be read: {error}") from error
+    except MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 0
+        raise ScenarioError(f"{path}:{line}: not YAML: {error.problem}") from error
+    except YAMLError as error:
+        raise ScenarioError(f"{path}: not YAML: {str(error).splitlines()[0]}") from error
+    if not isinstance(data, dict):
+        raise ScenarioError(f"{path}: expected keys and values, got {type(data).__name__}")
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        lines = [
+            f"{path}:{_line(data, e['loc'])}: {'.'.join(str(k) for k in e['loc'] if not _is_tag(k))}: {_say(e, model)}"
+            for e in error.errors()
+        ]
+        raise ScenarioError("\n".join(lines)) from error
+
+
+def _is_tag(key: int | str) -> bool:
+    return key in ("host-silence", "gps-outage")
+
+
+def _line(data: Any, loc: tuple[int | str, ...]) -> int:
+    """Line of the innermost key of an error's place that the file has."""
+    line = 1
+    for key in loc:
+        if isinstance(data, dict) and key in data:
+            line, data = data.lc.key(key)[0] + 1, data[key]  # type: ignore[attr-defined]
+        elif isinstance(data, list) and isinstance(key, int) and key < len(data):
+            line, data = data.lc.item(key)[0] + 1, data[key]  # type: ignore[attr-defined]
+    return line
+
+
+def _say(error: Any, model: type[BaseModel]) -> str:
+    if error["type"] == "extra_forbidden":
+        import difflib
+
+        owner: Any = model
+        for key in error["loc"][:-1]:
+            info = owner.model_fields.get(key) if isinstance(owner, type) and issubclass(owner, BaseModel) else None
+            owner = info.annotation if info else None
+        fields = list(owner.model_fields) if isinstance(owner, type) and issubclass(owner, BaseModel) else []
+        near = difflib.get_close_matches(str(error["loc"][-1]), fields, n=1)
+        return "unknown key" + (
+            f"; did you mean {near[0]}?" if near else f"; known are {', '.join(fields)}" if fields else ""
+        )
+    message = error["msg"].removeprefix("Value error, ")
+    value = error.get("input")
+    return f"{message} (got {value!r:.40})" if not isinstance(value, dict | list) else message

@@ -1,0 +1,18 @@
+"""What the tests of all packages share."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+_BESIDE_CHECKOUT = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder with captures and maps from outside, which are not part of the repository."""
+    named = os.environ.get("FAIRWAY_SHARED_DATA")
+    for folder in ([Path(named)] if named else []) + [_BESIDE_CHECKOUT]:
+        if folder.is_dir():
+            return folder
+    pytest.skip("shared/data is not beside the checkout")
