@@ -66,9 +66,12 @@ class Recorder:
                 channel, obj = channels[index]
                 data = obj.schema.to_proto(payload)
                 if causes:
+                    if any(oid not in by_oid for oid, _ in causes):
+                        self._register()
                     data += causes_to_proto([n for oid, w in causes for n in (by_oid[oid], w)])
                 self._mcap.add_message(channel, now_ns, data, max(0, t_data_ns), write & 0xFFFFFFFF)
         if self._stores[0].cycle % self._flush_every == 0:
+            self._mcap.flush()  # type: ignore[no-untyped-call]  # ends the open chunk, which file.flush alone would not
             self._file.flush()
 
     def close(self) -> None:

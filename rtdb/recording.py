@@ -16,9 +16,10 @@ import msgspec
 
 from .errors import ObjectMissing, RecordingError
 from .recorder import FORMAT
-from .records import Record, Schema, schema_of
+from .records import Record, Schema, causes_to_proto, schema_of
 
 R = TypeVar("R", bound=Record)
+_CAUSES = causes_to_proto([0])[:2]  # its tag
 log = logging.getLogger(__name__)
 
 
@@ -48,6 +49,7 @@ class Channel:
     descriptors: bytes
     in_trace: bool
     raw: list[_Raw] = field(default_factory=list)
+    parse: Callable[[bytes], Any] | None = None
 
 
 class Recording:
@@ -93,8 +95,8 @@ class Recording:
                     elif isinstance(record, Metadata) and record.name == "fairway":
                         self.metadata = record.metadata
                         tick_ns, t0_ns = int(record.metadata["tick_ns"]), int(record.metadata["t0_ns"])
-        except FileNotFoundError as error:
-            raise RecordingError(f"no recording at {self.path}") from error
+        except OSError as error:
+            raise RecordingError(f"no recording at {self.path}: {error.strerror}") from error
         except (McapError, struct.error, EOFError, KeyError, ValueError) as error:
             self.complete = False  # a process that was killed leaves an open chunk; what came before it is whole
             log.info("%s ends early: %s", self.path, error)
@@ -131,17 +133,34 @@ class Recording:
         """Read an object, or give an empty list where the recording has none."""
         return self.read(topic, cls) if topic in self.channels else []
 
+    def _by_topic(self, channel: Channel, data: bytes) -> bytes:
+        """Name causes by topic: channel ids depend on what else was recorded."""
+        if _CAUSES not in data:
+            return data
+        message = _parser(channel)(data)
+        pairs = list(message.causes)
+        names = " ".join(f"{self._topics[pairs[i]]} {pairs[i + 1]}" for i in range(0, len(pairs), 2))
+        message.ClearField("causes")
+        return bytes(message.SerializeToString(deterministic=True)) + names.encode()
+
     def trace_hash(self) -> str:
         """Hash of the trace."""
         digest = hashlib.sha256()
         rows = [(raw.cycle, c.topic, raw) for c in self.channels.values() if c.in_trace for raw in c.raw]
         for cycle, topic, raw in sorted(rows, key=lambda row: (row[0], row[1], row[2].write)):
             digest.update(b"%d %s %d %d " % (cycle, topic.encode(), raw.write, raw.t_data_ns))
-            digest.update(raw.data)
+            digest.update(self._by_topic(self.channels[topic], raw.data))
         return digest.hexdigest()
 
 
 def _parser(channel: Channel) -> Callable[[bytes], Any]:
+    """Make the function that parses a channel's messages, once per channel."""
+    if channel.parse is None:
+        channel.parse = _make_parser(channel)
+    return channel.parse
+
+
+def _make_parser(channel: Channel) -> Callable[[bytes], Any]:
     from google.protobuf import descriptor_pool, message_factory
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 

@@ -245,6 +245,9 @@ class Schema:
                 terms.append(f"*full(r.{f.name}, {f.spec.n}, {f.name!r}, True)")
             elif f.spec.kind == "str":
                 terms.append(f"encoded(r.{f.name}, {f.spec.n}, {f.name!r})")
+            elif f.spec.kind == "enum":
+                scope[f"e_{f.name}"] = {value: value for _, value in f.values}
+                terms.append(f"e_{f.name}[r.{f.name}]")
             else:
                 terms.append(f"r.{f.name}")
         call = eval(f"lambda r: pack({', '.join(terms)})", scope)
@@ -255,7 +258,7 @@ class Schema:
                 raise RecordError(f"expected a {name}, got {type(record).__name__}: {record!r:.80}")
             try:
                 return call(record)  # type: ignore[no-any-return]
-            except (struct.error, TypeError, OverflowError) as error:
+            except (struct.error, TypeError, OverflowError, AttributeError, KeyError, UnicodeError) as error:
                 raise RecordError(f"{name}: {self._misfit(record)} ({error})") from error
 
         return pack
@@ -264,10 +267,12 @@ class Schema:
         """Name the first field whose value its kind cannot hold."""
         for f in self.fields:
             value = getattr(record, f.name)
-            for item in value if f.spec.shape != "one" and isinstance(value, tuple) else (value,):
+            for item in value if f.spec.shape != "one" and isinstance(value, tuple | list) else (value,):
                 try:
+                    if f.spec.kind == "enum" and item not in dict(f.values).values():
+                        raise OverflowError
                     struct.pack("<" + KINDS[f.spec.kind].code, item if f.spec.kind != "str" else item.encode())
-                except (struct.error, OverflowError, AttributeError):
+                except (struct.error, OverflowError, AttributeError, UnicodeError):
                     return f"{f.name}={value!r:.60} does not fit {f.spec.kind}"
         return "a value does not fit"
 
@@ -322,12 +327,14 @@ class Schema:
     def c_struct(self) -> str:
         """Give the record as a C struct."""
         lines = [f"/* {self.doc.splitlines()[0] if self.doc else self.name} */", "typedef struct {"]
-        for f in self.fields:
+        for k, f in enumerate(self.fields):
+            align = "_Alignas(8) " if k == 0 else ""  # the size is a multiple of 8
             if f.spec.shape == "seq":
-                lines.append(f"    uint32_t {f.name}_n;")
+                lines.append(f"    _Alignas({8 if k == 0 else f.align}) uint32_t {f.name}_n;")
+                align = ""
             many = f"[{f.spec.n}]" if f.spec.shape != "one" or f.spec.kind == "str" else ""
             unit = f"[{f.spec.unit}] " if f.spec.unit else ""
-            lines.append(f"    {KINDS[f.spec.kind].c} {f.name}{many}; /* {unit}{f.spec.doc} */")
+            lines.append(f"    {align}{KINDS[f.spec.kind].c} {f.name}{many}; /* {unit}{f.spec.doc} */")
         return "\n".join(
             [*lines, f"}} fw_{self.name};", f'_Static_assert(sizeof(fw_{self.name}) == {self.size}, "{self.name}");']
         )
@@ -380,7 +387,7 @@ class Schema:
             )
             if f.spec.kind == "enum":
                 enum = message.enum_type.add(name=f"{f.name}_values")
-                for name, value in f.values:
+                for name, value in sorted(f.values, key=lambda item: item[1]):  # protobuf wants zero first
                     enum.value.add(name=f"{f.name}_{name}", number=value)
                 field.type_name = f".fairway.{self.name}.{f.name}_values"
         message.field.add(
@@ -457,6 +464,8 @@ def schema_of(cls: type[Record]) -> Schema:
         values = tuple((e.name, e.value) for e in _enum_of(cls, name)) if spec.kind == "enum" else ()
         if any(not 0 <= value <= 127 for _, value in values):
             raise RecordError(f"{cls.__name__}.{name}: enum8 holds values 0..127")
+        if values and 0 not in dict(values).values():
+            raise RecordError(f"{cls.__name__}.{name}: an enum needs a value 0, which protobuf takes for absent")
         if numbers is not None and name not in numbers:
             raise RecordError(
                 f"{cls.__name__}.{name} has no field number; add it: python -m rtdb.lock {cls.__module__}"

@@ -25,6 +25,7 @@ R = TypeVar("R", bound=Record)
 Causes = tuple[tuple[int, int], ...]
 
 HOST_DEPENDENT = 1  # flag: differs from run to run (process ids, timings); not part of the trace
+MAX_SLOTS = 1 << 24  # as in fw_insert
 STATIC = 2  # flag: written once; its age says nothing
 
 
@@ -190,10 +191,14 @@ class Component:
         writes once per edge.
         """
         full, core, schema = f"{self.name}/{name}", self._store.core, schema_of(cls)
+        if every < 1:
+            raise RecordError(f"cannot insert {full}: every={every} is not a number of ticks")
+        n_slots = int(history_s * 1e9 / (every * core.tick_ns)) + 4
+        if not 4 <= n_slots <= MAX_SLOTS:
+            raise RecordError(f"cannot insert {full}: history_s={history_s} is {n_slots} slots, at most {MAX_SLOTS}")
         try:
             index = core.find(full)
         except ObjectMissing:
-            n_slots = int(history_s * 1e9 / (every * core.tick_ns)) + 4
             index = core.insert(
                 full,
                 self.index,
@@ -239,7 +244,7 @@ class Store:
 
     def __init__(self, core: _core.Store) -> None:
         self.core = core
-        self._objects: dict[str, Object[Any]] = {}
+        self._objects: dict[tuple[str, type[Record] | None], Object[Any]] = {}
 
     @classmethod
     def create(
@@ -296,7 +301,7 @@ class Store:
     def find(self, name: str, cls: None = None, *, timeout_s: float = 0.0) -> Object[Any]: ...
     def find(self, name: str, cls: type[R] | None = None, *, timeout_s: float = 0.0) -> Object[R]:
         """Find an object by name, waiting for it at most timeout_s. Without its class, values come as dictionaries."""
-        key = name if cls is None else f"{name}:{cls.__qualname__}"
+        key = name, cls
         known = self._objects.get(key)
         if known is not None:
             return cast("Object[R]", known)
@@ -366,3 +371,4 @@ class Store:
     def restore(self, image: bytes) -> None:
         """Make a private store what it was when `image` was saved from it. Handles made before the save stay good."""
         self.core.restore(image)
+        self._objects.clear()

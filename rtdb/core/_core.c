@@ -389,12 +389,14 @@ static PyObject *waiting(Store *self, FAST, wait_call call, const char *subject)
     int64_t timeout = PyLong_AsLongLong(args[1]);
     if (timeout == -1 && PyErr_Occurred()) return NULL;
     int64_t deadline = fw_platform_monotonic_ns() + timeout, r;
-    do {
+    for (;;) { /* in slices, so that a signal just before the system call is noticed too */
+        int64_t left = deadline - fw_platform_monotonic_ns(), slice = left < 100000000 ? left : 100000000;
         Py_BEGIN_ALLOW_THREADS
-        r = call(self->db, n, deadline - fw_platform_monotonic_ns());
+        r = call(self->db, n, slice);
         Py_END_ALLOW_THREADS
-        if (r == -EINTR && PyErr_CheckSignals() < 0) return NULL;
-    } while (r == -EINTR);
+        if (PyErr_CheckSignals() < 0) return NULL;
+        if (r != -EINTR && (r != -ETIMEDOUT || slice == left)) break;
+    }
     if (r == -ETIMEDOUT) Py_RETURN_NONE;
     return r < 0 ? fail(r, "wait for", subject) : PyLong_FromLongLong(r);
 }

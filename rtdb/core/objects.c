@@ -105,6 +105,8 @@ int fw_join(fw_db *db, const char *name, int participant) {
 int fw_leave(fw_db *db, uint32_t component) {
     if (component >= fw_n_components(db) || !db->owned[component]) return -EPERM;
     db->owned[component] = 0;
+    for (uint32_t k = 0; k < db->n_refs; k++) /* what was begun is not committed after coming back */
+        if (db->refs[k].component == component) db->refs[k].begun = 0;
     int r = fw_lock(db, FW_LOCK_COMPONENT + component, F_UNLCK);
     fw_notify(db, &db->wake->done);
     return r;

@@ -65,11 +65,13 @@ static inline void fw_copy_out(void *to, const void *slot, uint32_t n) {
     if (n) { uint64_t v = FW_LOAD(*from, relaxed); memcpy(dst, &v, n); }
 }
 
-/* May the writer overwrite the slot of write w - n? Older values of now and before only make it more careful. */
+/* May the writer overwrite the slot of write w - n? `now` is read before `before`, and written after it: a `before` of
+ * 0 then means that `now` is the first write ever named. Older values of both only make the writer more careful. */
 static inline int fw_may_write(fw_ring *ring, fw_cuts *cuts, fw_clock *clock, uint64_t w, uint32_t n) {
     uint64_t epoch = FW_LOAD(clock->epoch, acquire); /* with tick 1 */
+    uint64_t now = FW_LOAD(cuts->now, acquire); /* with tick 4 */
     uint64_t keep = FW_LOAD(cuts->before, relaxed);
-    if (!keep) keep = FW_LOAD(cuts->now, relaxed);
+    if (!keep) keep = now;
     if (!keep && FW_LOAD(ring->ep, relaxed) == epoch) keep = FW_LOAD(ring->base, relaxed);
     return !keep || w < keep + n;
 }
@@ -116,14 +118,17 @@ static inline void fw_tick_object(fw_ring *ring, fw_cuts *cuts, uint32_t n, uint
 #ifndef FW_MUTANT_NAIVE_PASS
     if (FW_LOAD(ring->ep, acquire) >= c) h = FW_LOAD(ring->base, relaxed);
 #endif
-    uint64_t now = FW_LOAD(cuts->now, relaxed);
-    if (h == now) return;
+    uint64_t now = k ? FW_LOAD(cuts->log[(k - 1) % n].write, relaxed) : 0; /* not cuts->now: a dead clock may be ahead */
+    if (h == now) { /* two cuts show the same: the writer may have the older one's slot */
+        if (FW_LOAD(cuts->before, relaxed) != now) FW_STORE(cuts->before, now, relaxed);
+        return;
+    }
     if (k >= n) FW_STORE(cuts->tail, k - n + 1, relaxed);
     FW_FENCE(release); /* with look-up 3 */
     FW_STORE(cuts->log[k % n].cycle, c, relaxed);
     FW_STORE(cuts->log[k % n].write, h, relaxed);
     FW_STORE(cuts->before, now, relaxed);
-    FW_STORE(cuts->now, h, relaxed);
+    FW_STORE(cuts->now, h, release); /* with fw_may_write */
     FW_STORE(cuts->head, k + 1, release);
 }
 
@@ -146,7 +151,7 @@ static inline int64_t fw_cut_find(fw_cuts *cuts, uint32_t n, uint64_t c) {
     }
     FW_FENCE(acquire); /* 3: with the append */
     uint64_t tail_now = FW_LOAD(cuts->tail, relaxed);
-    if (lo == tail && tail) return -ESTALE;           /* all entries that are left are younger than c */
+    if (lo == tail && tail_now) return -ESTALE;       /* all entries that are left are younger than c */
     if (lo && lo - 1 < tail_now) return -ESTALE;      /* the entry that was found is being overwritten */
     return (int64_t)write;
 }

@@ -1,0 +1,379 @@
+"""Recordings: what was written is read back, whole or cut off, by this version or a later one."""
+
+import io
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Annotated
+
+import pytest
+
+from rtdb import ObjectMissing, Record, RecordError, RecordingError, Store
+from rtdb.recorder import Recorder
+from rtdb.recording import Recorded, Recording
+from rtdb.records import array, enum8, f8, flag, i64, seq, text, u8
+from rtdb.store import HOST_DEPENDENT
+
+T0_NS = 1_700_000_000_000_000_000
+
+
+class Mode(IntEnum):
+    OFF = 0
+    ON = 1
+
+
+class Count(Record):
+    n: Annotated[int, i64("", "number")] = 0
+
+
+class Mixed(Record):
+    """A bit of everything."""
+
+    x_m: Annotated[float, f8("m", "east")] = 0.0
+    ok: Annotated[bool, flag("flag")] = False
+    mode: Annotated[Mode, enum8("mode")] = Mode.OFF
+    words: Annotated[str, text(12, "words")] = ""
+    some: Annotated[tuple[float, ...], seq("f8", 4, "m", "numbers")] = ()
+    three: Annotated[tuple[int, ...], array("u8", 3, "", "bytes")] = (0, 0, 0)
+
+
+def mixed(k):
+    return Mixed(
+        k / 3, k % 2 == 0, Mode(k % 2), f"wörd {k}", tuple(float(i) for i in range(k % 5)), (k % 256, 0, 255)
+    )
+
+
+def drive(path, ticks=200, order: Sequence[str] = ("a", "b", "c"), noise=0, t0_ns=T0_NS):
+    """Record three components on two stores; returns what should be read back, by topic."""
+    expected = {"a/in": [], "b/out": [], "c/slow": []}
+    with Store.create(t0_ns=t0_ns) as cart, Store.create(t0_ns=t0_ns) as world:
+        made = {}
+        for name in order:
+            if name == "a":
+                made["a"] = cart.join("a").insert("in", Mixed)
+            if name == "b":
+                made["b"] = cart.join("b").insert("out", Count, n_causes=2)
+                made["pid"] = cart.find("b/out") and cart.join("host").insert(
+                    "pid", Count, flags=HOST_DEPENDENT
+                )
+            if name == "c":
+                made["c"] = world.join("c").insert("slow", Count, every=5, phase=3)
+        with Recorder(path, [cart, world], {"scenario": "test"}) as recorder:
+            for c in range(1, ticks + 1):
+                now = cart.now_ns
+                value = mixed(c)
+                w = made["a"].write(value, now - 3)
+                expected["a/in"].append(Recorded(value, c, w, max(0, now - 3), ()))
+                seen = cart.snapshot().get(made["a"])
+                if seen and c % 2:
+                    w = made["b"].write(Count(c), seen.t_data_ns, ((made["a"].oid, seen.write),))
+                    expected["b/out"].append(
+                        Recorded(Count(c), c, w, seen.t_data_ns, (("a/in", seen.write),))
+                    )
+                made["pid"].write(Count(c * noise))
+                w = made["c"].write(Count(-c), now)
+                if c % 5 == 3:
+                    expected["c/slow"].append(Recorded(Count(-c), c, w, now, ()))
+                cart.tick()
+                world.tick()
+                recorder.record()
+    return expected
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run.mcap"
+
+
+CLASSES = {"a/in": Mixed, "b/out": Count, "c/slow": Count}
+
+
+def read_all(recording):
+    return {topic: recording.read(topic, cls) for topic, cls in CLASSES.items()}
+
+
+def test_what_became_visible_is_read_back(path):
+    expected = drive(path)
+    recording = Recording(path)
+    assert recording.complete
+    assert read_all(recording) == expected
+    assert (recording.tick_ns, recording.t0_ns, recording.metadata["scenario"]) == (10_000_000, T0_NS, "test")
+    assert (recording.last_cycle, recording.time_s(150)) == (200, 1.5)
+
+
+def test_causes_are_read_back_by_topic(path):
+    drive(path, ticks=9)
+    causes = [(row.cycle, row.causes) for row in Recording(path).read("b/out", Count)]
+    assert causes == [(3, (("a/in", 2),)), (5, (("a/in", 4),)), (7, (("a/in", 6),)), (9, (("a/in", 8),))]
+
+
+def test_objects_that_come_during_the_recording_are_in_it(path):
+    with Store.create() as store, Recorder(path, [store], {}) as recorder:
+        a = store.join("a")
+        for k in range(5):
+            a.insert(f"n{k}", Count).write(Count(k))
+            store.tick()
+            recorder.record()
+    recording = Recording(path)
+    assert {t: [(r.value.n, r.cycle) for r in recording.read(t, Count)] for t in recording.channels} == {
+        f"a/n{k}": [(k, k + 1)] for k in range(5)
+    }
+
+
+def test_a_cause_that_has_not_become_visible_yet_is_recorded(path):
+    """A free-running component may name the newest write of an object whose edge is later than its own."""
+    with Store.create() as store:
+        a = store.join("a")
+        out = a.insert("out", Count, n_causes=1)
+        with Recorder(path, [store], {}) as recorder:
+            late = a.insert("late", Count, every=100)
+            out.write(Count(1), causes=((late.oid, late.write(Count(1))),))
+            store.tick()
+            recorder.record()
+    assert Recording(path).read("a/out", Count)[0].causes == (("a/late", 1),)
+
+
+# -- cut off ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_a_recording_that_was_cut_off_is_readable_up_to_there(path, share):
+    expected = drive(path, ticks=3000)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    recording = Recording(path)
+    assert not recording.complete
+    assert recording.last_cycle >= 3000 * (share - 0.2)
+    for topic, rows in read_all(recording).items():
+        assert rows == expected[topic][: len(rows)]
+        assert len(rows) >= len(expected[topic]) * (share - 0.2)
+
+
+def test_a_recording_cut_off_anywhere_is_a_beginning_and_is_said_to_be_incomplete(path):
+    expected = drive(path, ticks=12)
+    data = path.read_bytes()
+    readable = 0
+    for size in range(0, len(data), 7):
+        path.write_bytes(data[:size])
+        try:
+            recording = Recording(path)
+        except RecordingError:
+            continue
+        readable += 1
+        assert not recording.complete
+        for topic in recording.channels.keys() & expected.keys():
+            rows = recording.read(topic, CLASSES[topic])
+            assert rows == expected[topic][: len(rows)]
+    assert readable > 10
+
+
+def test_a_recorder_that_was_never_closed_leaves_what_it_flushed(path):
+    with Store.create() as store:
+        writer = store.join("a").insert("n", Count)
+        recorder = Recorder(path, [store], {})
+        for c in range(1, 3001):
+            writer.write(Count(c))
+            store.tick()
+            recorder.record()
+        data = path.read_bytes()
+        recorder.close()
+    path.write_bytes(data)
+    recording = Recording(path)
+    rows = recording.read("a/n", Count)
+    assert not recording.complete
+    assert [row.value.n for row in rows] == list(range(1, len(rows) + 1))
+    assert len(rows) > 1000
+
+
+def test_no_more_than_a_second_and_a_half_is_lost_when_the_process_dies(path):
+    """As the recorder's first lines promise: flushed once a second of store time."""
+    with Store.create() as store:
+        writer = store.join("a").insert("n", Count)
+        recorder = Recorder(path, [store], {})
+        for c in range(1, 401):
+            writer.write(Count(c))
+            store.tick()
+            recorder.record()
+        data = path.read_bytes()
+        recorder.close()
+    path.write_bytes(data)
+    assert Recording(path).last_cycle >= 250
+
+
+# -- evolution --------------------------------------------------------------------------------------------------
+
+
+class V1:
+    class Thing(Record):
+        x_m: Annotated[float, f8("m", "east")] = 0.0
+        old: Annotated[int, i64("", "went away")] = 0
+        mode: Annotated[Mode, enum8("mode")] = Mode.OFF
+
+
+class V2:
+    class Thing(Record):
+        mode: Annotated[Mode, enum8("mode")] = Mode.OFF
+        x_m: Annotated[float, f8("m", "east")] = 0.0
+        quality: Annotated[float, f8("", "was added")] = 0.25
+        note: Annotated[str, text(8, "was added")] = "none"
+
+
+class OtherUnit:
+    class Thing(Record):
+        x_m: Annotated[float, f8("km", "east")] = 0.0
+
+
+class OtherType:
+    class Thing(Record):
+        x_m: Annotated[int, i64("m", "east")] = 0
+
+
+class OtherShape:
+    class Thing(Record):
+        x_m: Annotated[tuple[float, ...], seq("f8", 3, "m", "east")] = ()
+
+
+class Demanding:
+    class Thing(Record):
+        needed: Annotated[int, u8("", "has no default")]
+        x_m: Annotated[float, f8("m", "east")] = 0.0
+
+
+@pytest.fixture
+def old(path):
+    """A recording of the first version."""
+    with Store.create() as store:
+        writer = store.join("a").insert("thing", V1.Thing)
+        with Recorder(path, [store], {}) as recorder:
+            for c in (1, 2):
+                writer.write(V1.Thing(c * 1.5, c, Mode.ON))
+                store.tick()
+                recorder.record()
+    return Recording(path)
+
+
+def test_a_field_that_was_added_takes_its_default_and_one_that_was_removed_is_ignored(old):
+    assert [row.value for row in old.read("a/thing", V2.Thing)] == [
+        V2.Thing(Mode.ON, 1.5, 0.25, "none"),
+        V2.Thing(Mode.ON, 3.0, 0.25, "none"),
+    ]
+
+
+@pytest.mark.parametrize("later", [OtherUnit, OtherType, OtherShape])
+def test_a_field_that_changed_its_meaning_is_an_error_that_names_it(old, later):
+    with pytest.raises((RecordError, RecordingError), match=r"Thing\.x_m"):
+        old.read("a/thing", later.Thing)
+
+
+def test_a_field_that_was_added_without_a_default_is_an_error_that_names_it(old):
+    with pytest.raises(RecordingError, match="a/thing has no needed"):
+        old.read("a/thing", Demanding.Thing)
+
+
+def test_a_topic_that_was_not_recorded_is_an_error_that_names_what_was(old):
+    with pytest.raises(ObjectMissing, match=r"no/thing.*a/thing"):
+        old.read("no/thing", V1.Thing)
+    assert old.find("no/thing", V1.Thing) == []
+    assert len(old.find("a/thing", V1.Thing)) == 2
+
+
+# -- trace ------------------------------------------------------------------------------------------------------
+
+
+def trace(path, **options):
+    drive(path, ticks=30, **options)
+    return Recording(path).trace_hash()
+
+
+def test_the_trace_does_not_depend_on_who_came_first(path):
+    assert trace(path) == trace(path, order=("c", "b", "a")) == trace(path, order=("b", "a", "c"))
+
+
+def test_what_depends_on_the_host_is_recorded_but_not_in_the_trace(path):
+    quiet = trace(path, noise=0)
+    assert trace(path, noise=1) == quiet
+    assert [row.value.n for row in Recording(path).read("host/pid", Count)] == list(range(1, 31))
+
+
+def one_run(path, values, data_time=0, name="n"):
+    with Store.create() as store:
+        writer = store.join("a").insert(name, Count)
+        with Recorder(path, [store], {}) as recorder:
+            for value in values:
+                if value is not None:
+                    writer.write(Count(value), data_time)
+                store.tick()
+                recorder.record()
+    return Recording(path).trace_hash()
+
+
+def test_the_trace_tells_values_times_names_and_cycles_apart(path):
+    runs = [
+        one_run(path, [1, 2]),
+        one_run(path, [1, 3]),
+        one_run(path, [1, 2], data_time=1),
+        one_run(path, [1, 2], name="m"),
+        one_run(path, [1, None, 2]),
+        one_run(path, [1]),
+    ]
+    assert len(set(runs)) == len(runs)
+    assert one_run(path, [1, 2]) == runs[0]
+
+
+def test_the_trace_does_not_depend_on_which_host_dependent_objects_there_are(path):
+    """A run with more tools or processes beside it is the same run, causes included."""
+    hashes = []
+    for host in (False, True):
+        with Store.create() as store:
+            if host:
+                store.join("aa").insert("pid", Count, flags=HOST_DEPENDENT)
+            a = store.join("b")
+            source, sink = a.insert("in", Count), a.insert("out", Count, n_causes=1)
+            with Recorder(path, [store], {}) as recorder:
+                sink.write(Count(1), causes=((source.oid, source.write(Count(1))),))
+                store.tick()
+                recorder.record()
+        hashes.append(Recording(path).trace_hash())
+    assert hashes[0] == hashes[1]
+
+
+# -- not a recording --------------------------------------------------------------------------------------------
+
+
+def foreign():
+    """An MCAP file of somebody else."""
+    from mcap.writer import Writer
+
+    file = io.BytesIO()
+    writer = Writer(file)
+    writer.start(profile="", library="other")
+    schema = writer.register_schema("s", "jsonschema", b"{}")
+    channel = writer.register_channel("t", "json", schema)
+    writer.add_message(channel, 1, b"{}", 1)
+    writer.finish()
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"junk", bytes(1000), b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + bytes(range(256)), foreign()],
+    ids=["empty", "junk", "zeros", "magic", "damaged", "foreign"],
+)
+def test_a_file_that_is_no_recording_is_one_clear_error(path, data):
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"run\.mcap is not a recording of Fairway") as refused:
+        Recording(path)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_recording_that_is_not_there_is_one_clear_error(tmp_path):
+    with pytest.raises(RecordingError, match=r"no recording at .*gone\.mcap"):
+        Recording(tmp_path / "gone.mcap")
+    with pytest.raises(RecordingError, match=r"recording"):
+        Recording(tmp_path)
+
+
+def test_a_recording_of_a_later_format_is_refused(path):
+    with Store.create() as store, Recorder(path, [store], {"format": "2"}):
+        pass
+    with pytest.raises(RecordingError, match="format 2"):
+        Recording(path)
