@@ -121,6 +121,25 @@ class GpsFix(Record, frozen=True):
     utc_ns: Annotated[int, i64("ns", "UTC of the measurement since 1970, 0 = date unknown")] = 0
 
 
+class CompassHeading(Record, frozen=True):
+    """One reading of the compass, turned to true north by the declination of place and date."""
+
+    yaw_rad: Annotated[float, f8("rad", "yaw of the cart, declination applied, in (-pi, pi]")] = 0.0
+    pitch_rad: Annotated[float, f8("rad", "nose up positive")] = 0.0
+    roll_rad: Annotated[float, f8("rad", "left side up positive")] = 0.0
+    valid: Annotated[bool, flag("the compass gives a heading and raises no alarm")] = False
+
+
+class Scan(Record, frozen=True):
+    """One sweep of a planar range scanner, counter-clockwise from `first_rad` in steps of `step_rad`, in C."""
+
+    first_rad: Annotated[float, f8("rad", "direction of the first ray, 0 = ahead, left positive")] = 0.0
+    step_rad: Annotated[float, f8("rad", "angle between rays")] = 0.0
+    max_m: Annotated[float, f8("m", "reach; a range of this size means that nothing was seen")] = 0.0
+    mount_x_m: Annotated[float, f8("m", "the scanner's place ahead of the rear axle")] = 0.0
+    range_m: Annotated[tuple[float, ...], seq("f4", 181, "m", "range of each ray")] = ()
+
+
 class Odometry(Record, frozen=True):
     """Wheel odometry from the free-running tick counters of the rear wheels."""
 
@@ -292,6 +311,50 @@ class CartTruth(Record, frozen=True):
     steer_rad: Annotated[float, f8("rad", "road-wheel angle")] = 0.0
     brake: Annotated[float, f8("1", "brake effort")] = 0.0
     distance_m: Annotated[float, f8("m", "path length driven")] = 0.0
+
+
+class ObstacleKind(IntEnum):
+    """What stands about."""
+
+    BOX = 0
+    CAR = 1
+    POST = 2
+    ISLAND = 3
+    KERB = 4
+    PERSON = 5
+    WALL = 6
+
+
+class Scene(Record, frozen=True):
+    """The static world in M: boxes by their centre, and the outline of the area that may be driven."""
+
+    kind: Annotated[tuple[int, ...], seq("u8", 192, "", "ObstacleKind of each box")] = ()
+    x_m: Annotated[tuple[float, ...], seq("f4", 192, "m", "east of the centre")] = ()
+    y_m: Annotated[tuple[float, ...], seq("f4", 192, "m", "north of the centre")] = ()
+    z_m: Annotated[tuple[float, ...], seq("f4", 192, "m", "height of the centre over the origin")] = ()
+    yaw_rad: Annotated[tuple[float, ...], seq("f4", 192, "rad", "direction of the length")] = ()
+    length_m: Annotated[tuple[float, ...], seq("f4", 192, "m", "size along its yaw")] = ()
+    width_m: Annotated[tuple[float, ...], seq("f4", 192, "m", "size across")] = ()
+    height_m: Annotated[tuple[float, ...], seq("f4", 192, "m", "size upward")] = ()
+    boundary_x_m: Annotated[tuple[float, ...], seq("f4", 32, "m", "corners of the area that may be driven, east")] = ()
+    boundary_y_m: Annotated[tuple[float, ...], seq("f4", 32, "m", "north")] = ()
+
+
+class ActorsTruth(Record, frozen=True):
+    """Where the moving actors really are, in M."""
+
+    kind: Annotated[tuple[int, ...], seq("u8", 8, "", "ObstacleKind of each actor")] = ()
+    x_m: Annotated[tuple[float, ...], seq("f8", 8, "m", "east")] = ()
+    y_m: Annotated[tuple[float, ...], seq("f8", 8, "m", "north")] = ()
+    yaw_rad: Annotated[tuple[float, ...], seq("f8", 8, "rad", "direction of walking")] = ()
+
+
+class Clearance(Record, frozen=True):
+    """How close the cart's body really is to anything that it must not touch."""
+
+    distance_m: Annotated[float, f8("m", "to the nearest obstacle or actor, at most 5; negative when touching")] = 5.0
+    collided: Annotated[bool, flag("it has touched something since the start")] = False
+    kind: Annotated[ObstacleKind, enum8("what the nearest thing is")] = ObstacleKind.BOX
 
 
 class FaultEvent(Record, frozen=True):
