@@ -1,16 +1,31 @@
-"""Follow: from way-point to way-point by pure pursuit.
+"""Follow: plan a line through the way-points once, then track it by pure pursuit.
 
-Steer on the circle through the rear axle and a goal point a look-ahead ahead on the course line: curvature = 2 y / L^2
-(Coulter, Implementation of the Pure Pursuit Path Tracking Algorithm, CMU-RI-TR-92-01, 1992). Speed falls before corners
-and before the end so that neither lateral acceleration nor braking exceed what is comfortable.
+The line: straight legs whose corners are rounded as far as the target radius of the way-point allows, so that turns are
+taken economically; a corner too sharp for that is driven up to and turned at full lock. Along the line stands a speed
+that keeps lateral acceleration and braking comfortable. Tracking: steer on the circle through the rear axle and a goal
+point a look-ahead further on the line, curvature = 2 y / L^2 (Coulter, Implementation of the Pure Pursuit Path Tracking
+Algorithm, CMU-RI-TR-92-01, 1992).
 """
 
 import math
+from itertools import pairwise
+from typing import NamedTuple
 
 from autonomy import Input, Module, Output, Param
 from hal.signals import STOP, Course, DriveCommand, FollowState, LocalPlane, Pose, Site
 
 Point = tuple[float, float]
+SPACING_M = 0.5
+
+
+class Station(NamedTuple):
+    """A point of the line: how far along it is, how fast to be there, and which way-point comes next."""
+
+    s_m: float
+    x_m: float
+    y_m: float
+    speed_mps: float
+    waypoint: int
 
 
 class Follow(Module):
@@ -24,98 +39,165 @@ class Follow(Module):
 
     wheelbase_m = Param(1.66, unit="m")
     max_steer_rad = Param(0.46, unit="rad")
+    turn_radius_m = Param(3.8, unit="m")
     lookahead_s = Param(0.8, unit="s")
-    min_lookahead_m = Param(2.4, unit="m")
+    min_lookahead_m = Param(2.2, unit="m")
     lateral_mps2 = Param(1.2, unit="m/s2")
     decel_mps2 = Param(0.7, unit="m/s2")
+    cut = Param(0.5, unit="1")
 
     def reset(self) -> None:
-        """Forget the course."""
-        self._line: list[Point] = []
-        self._leg = 0
+        """Forget the line."""
+        self._line: list[Station] = []
+        self._at = 0
 
     def step(self) -> None:
         """Aim at the goal point; choose the speed."""
         if not self._line:
-            self._plan()
+            self._line = self._plan()
         here = (self.pose.x_m, self.pose.y_m)
-        self._advance(here)
-        along, lateral_m = on_leg(self._line[self._leg], self._line[self._leg + 1], here)
-        finished = (self._leg == len(self._line) - 2 and math.dist(here, self._line[-1]) < 0.5) or self._past_end(along)
-        self.state = FollowState(waypoint=self._leg, finished=finished, lateral_error_m=lateral_m)
+        self._at = nearest(self._line, self._at, here)
+        end = self._line[-1]
+        last = end.s_m - self._line[self._at].s_m
+        finished = last < SPACING_M or (last < 2.0 and math.dist(here, (end.x_m, end.y_m)) < SPACING_M)
+        lateral_m = self._lateral_error(here)
+        self.state = FollowState(self._line[self._at].waypoint, finished, lateral_m)
         if finished:
-            self.drive = DriveCommand(0.0, 0.0)
+            self.drive = DriveCommand(0.0, 0.0, 1.0)
             return
         lookahead_m = max(self.min_lookahead_m, self.lookahead_s * abs(self.pose.speed_mps))
-        goal = self._goal(along, lookahead_m)
-        curvature = self._curvature(goal)
-        steer_rad = math.atan(self.wheelbase_m * curvature)
+        steer_rad = math.atan(self.wheelbase_m * self._curvature(self._goal(lookahead_m)))
         steer_rad = min(max(steer_rad, -self.max_steer_rad), self.max_steer_rad)
-        self.drive = DriveCommand(speed_mps=self._speed(along, curvature), steer_rad=steer_rad, decel_mps2=1.2)
+        self.drive = DriveCommand(speed_mps=self._speed(steer_rad, lateral_m), steer_rad=steer_rad, decel_mps2=1.0)
 
-    def _plan(self) -> None:
+    def _plan(self) -> list[Station]:
         """Turn the course into a line in M that begins where the cart stands."""
-        plane = LocalPlane.at(self.site.lat_rad, self.site.lon_rad)
-        points = [plane.to_map(lat, lon) for lat, lon in zip(self.course.lat_rad, self.course.lon_rad, strict=True)]
-        self._line = [(self.pose.x_m, self.pose.y_m), *points]
+        plane, course = LocalPlane.at(self.site.lat_rad, self.site.lon_rad), self.course
+        corners = [plane.to_map(lat, lon) for lat, lon in zip(course.lat_rad, course.lon_rad, strict=True)]
+        corners.insert(0, (self.pose.x_m, self.pose.y_m))
+        allowed = [self.cut * radius_m for radius_m in course.radius_m]
+        points = rounded(corners, allowed, self.turn_radius_m)
+        radii = widened(bend_radii(points), self.turn_radius_m)
+        speeds = [min(course.speed_mps, math.sqrt(self.lateral_mps2 * radius_m)) for radius_m in radii]
+        return stations(points, speeds, self.decel_mps2)
 
-    def _advance(self, here: Point) -> None:
-        """Go on to the next leg when this one's end is passed."""
-        while self._leg < len(self._line) - 2:
-            start, end = self._line[self._leg], self._line[self._leg + 1]
-            along, _ = on_leg(start, end, here)
-            if along < math.dist(start, end) - 0.3 * self.course.radius_m[self._leg]:
-                return
-            self._leg += 1
-
-    def _past_end(self, along_m: float) -> bool:
-        start, end = self._line[-2], self._line[-1]
-        return self._leg == len(self._line) - 2 and along_m >= math.dist(start, end)
-
-    def _goal(self, along_m: float, lookahead_m: float) -> Point:
-        """Walk the look-ahead along the line."""
-        left, leg = max(along_m, 0.0) + lookahead_m, self._leg
-        while True:
-            start, end = self._line[leg], self._line[leg + 1]
-            length = math.dist(start, end)
-            if left <= length or leg == len(self._line) - 2:
-                part = left / length
-                return start[0] + part * (end[0] - start[0]), start[1] + part * (end[1] - start[1])
-            left, leg = left - length, leg + 1
+    def _goal(self, lookahead_m: float) -> Point:
+        """Give the point of the line a look-ahead on; beyond the end, straight on."""
+        wanted_m = self._line[self._at].s_m + lookahead_m
+        for k in range(self._at, len(self._line) - 1):
+            if self._line[k + 1].s_m >= wanted_m:
+                break
+        a, b = self._line[k], self._line[k + 1]
+        part = (wanted_m - a.s_m) / (b.s_m - a.s_m)
+        return a.x_m + part * (b.x_m - a.x_m), a.y_m + part * (b.y_m - a.y_m)
 
     def _curvature(self, goal: Point) -> float:
         dx, dy = goal[0] - self.pose.x_m, goal[1] - self.pose.y_m
         c, s = math.cos(self.pose.yaw_rad), math.sin(self.pose.yaw_rad)
         ahead_m, left_m = dx * c + dy * s, dy * c - dx * s
         if ahead_m < 0:  # behind: the tightest turn on that side
-            left_m = math.copysign(max(abs(left_m), 1.0), left_m)
+            return math.copysign(1.0, left_m)
         return 2.0 * left_m / (dx * dx + dy * dy)
 
-    def _speed(self, along_m: float, curvature: float) -> float:
-        speed_mps = self.course.speed_mps
-        if abs(curvature) > 1e-6:
-            speed_mps = min(speed_mps, math.sqrt(self.lateral_mps2 / abs(curvature)))
-        distance_m = math.dist(self._line[self._leg], self._line[self._leg + 1]) - along_m
-        for k in range(self._leg + 1, len(self._line)):
-            distance_m = max(distance_m, 0.0)
-            corner_mps = self._corner_speed(k) if k < len(self._line) - 1 else 0.3
-            speed_mps = min(speed_mps, math.sqrt(corner_mps**2 + 2.0 * self.decel_mps2 * distance_m))
-            if distance_m > 20.0 or k == len(self._line) - 1:
-                break
-            distance_m += math.dist(self._line[k], self._line[k + 1])
-        return speed_mps
+    def _speed(self, steer_rad: float, lateral_m: float) -> float:
+        """Give the line's speed here, and no more than the present steering, or finding back to the line, allows."""
+        curvature = abs(math.tan(steer_rad)) / self.wheelbase_m
+        planned_mps = self._line[self._at].speed_mps
+        if abs(lateral_m) > 0.7:
+            planned_mps = min(planned_mps, math.sqrt(self.lateral_mps2 * self.turn_radius_m))
+        return min(planned_mps, math.sqrt(self.lateral_mps2 / curvature)) if curvature > 1e-6 else planned_mps
 
-    def _corner_speed(self, k: int) -> float:
-        """Speed through the corner at point k: on the arc that the look-ahead cuts out of it."""
-        (ax, ay), (bx, by), (cx, cy) = self._line[k - 1], self._line[k], self._line[k + 1]
-        turn = abs(math.remainder(math.atan2(cy - by, cx - bx) - math.atan2(by - ay, bx - ax), 2 * math.pi))
-        if turn < 0.05:
-            return self.course.speed_mps
-        radius_m = max(
-            self.min_lookahead_m / math.tan(turn / 2) if turn < math.pi - 0.1 else 0.0,
-            self.wheelbase_m / math.tan(self.max_steer_rad),
-        )
-        return math.sqrt(self.lateral_mps2 * radius_m)
+    def _lateral_error(self, here: Point) -> float:
+        a, b = self._line[min(self._at, len(self._line) - 2)], self._line[min(self._at, len(self._line) - 2) + 1]
+        return on_leg((a.x_m, a.y_m), (b.x_m, b.y_m), here)[1]
+
+
+# -- the line -------------------------------------------------------------------------------------------------------
+
+
+def rounded(corners: list[Point], allowed_m: list[float], least_radius_m: float) -> list[tuple[float, float, int]]:
+    """Give points (x, y, way-point ahead) every half metre along legs whose corners are rounded.
+
+    allowed_m: how far the line may stay away from each corner after the first. An arc of radius R misses a corner that
+    turns by a by R (1 / cos(a/2) - 1). Where even the least radius would miss it by more, the corner stays.
+    """
+    points: list[tuple[float, float, int]] = [(*corners[0], 0)]
+    for k in range(1, len(corners)):
+        corner = corners[k]
+        if k == len(corners) - 1:
+            _straight(points, corner, k - 1)
+            break
+        before, after = corners[k - 1], corners[k + 1]
+        a_in = math.atan2(corner[1] - before[1], corner[0] - before[0])
+        a_out = math.atan2(after[1] - corner[1], after[0] - corner[0])
+        turn = math.remainder(a_out - a_in, 2 * math.pi)
+        miss = 1.0 / math.cos(turn / 2) - 1.0 if abs(turn) < 3.0 else math.inf
+        longest = 0.45 * min(math.dist(before, corner), math.dist(corner, after))
+        radius_m = min(allowed_m[k - 1] / max(miss, 1e-9), longest / max(math.tan(abs(turn) / 2), 1e-9))
+        if abs(turn) < 0.02 or radius_m < least_radius_m:
+            _straight(points, corner, k - 1)
+            continue
+        tangent_m = radius_m * math.tan(abs(turn) / 2)
+        start = (corner[0] - tangent_m * math.cos(a_in), corner[1] - tangent_m * math.sin(a_in))
+        _straight(points, start, k - 1)
+        side = math.copysign(1.0, turn)
+        centre = (start[0] - side * radius_m * math.sin(a_in), start[1] + side * radius_m * math.cos(a_in))
+        n = max(2, int(radius_m * abs(turn) / SPACING_M))
+        for i in range(1, n + 1):
+            a = a_in + turn * i / n
+            point = (centre[0] + side * radius_m * math.sin(a), centre[1] - side * radius_m * math.cos(a))
+            points.append((*point, k - 1 if i <= n // 2 else k))
+    return points
+
+
+def _straight(points: list[tuple[float, float, int]], end: Point, waypoint: int) -> None:
+    x, y, _ = points[-1]
+    length = math.dist((x, y), end)
+    n = max(1, int(length / SPACING_M))
+    if length > 1e-6:
+        points += [(x + (end[0] - x) * i / n, y + (end[1] - y) * i / n, waypoint) for i in range(1, n + 1)]
+
+
+def bend_radii(points: list[tuple[float, float, int]]) -> list[float]:
+    """Give the radius of the line at each point."""
+    out = [math.inf]
+    for (ax, ay, _), (x, y, _), (bx, by, _) in zip(points, points[1:], points[2:], strict=False):
+        turn = abs(math.remainder(math.atan2(by - y, bx - x) - math.atan2(y - ay, x - ax), 2 * math.pi))
+        length_m = (math.dist((ax, ay), (x, y)) + math.dist((x, y), (bx, by))) / 2
+        out.append(length_m / turn if turn > 1e-6 else math.inf)
+    return [*out, math.inf]
+
+
+def widened(radii_m: list[float], least_m: float) -> list[float]:
+    """Spread each corner that is too sharp to follow over where the cart turns at full lock: before and behind it."""
+    out = [max(radius_m, least_m) for radius_m in radii_m]
+    for k, radius_m in enumerate(radii_m):
+        if radius_m < least_m:
+            for j in range(max(0, k - 7), min(len(out), k + 11)):
+                out[j] = least_m
+    return out
+
+
+def stations(points: list[tuple[float, float, int]], speeds: list[float], decel_mps2: float) -> list[Station]:
+    """Put lengths and speeds together; going backward, lower each speed to what braking to the next one allows."""
+    lengths = [0.0]
+    for (ax, ay, _), (bx, by, _) in pairwise(points):
+        lengths.append(lengths[-1] + math.dist((ax, ay), (bx, by)))
+    planned = [*speeds[:-1], 0.3]
+    for k in range(len(points) - 2, -1, -1):
+        step_m = lengths[k + 1] - lengths[k]
+        planned[k] = min(planned[k], math.sqrt(planned[k + 1] ** 2 + 2.0 * decel_mps2 * step_m))
+    return [Station(s, x, y, v, w) for s, (x, y, w), v in zip(lengths, points, planned, strict=True)]
+
+
+def nearest(line: list[Station], at: int, here: Point) -> int:
+    """Give the nearest station, looking a few metres ahead of the last one: progress never goes back."""
+    best, best_m = at, math.inf
+    for k in range(at, min(at + 12, len(line))):
+        distance_m = math.hypot(line[k].x_m - here[0], line[k].y_m - here[1])
+        if distance_m < best_m:
+            best, best_m = k, distance_m
+    return best
 
 
 def on_leg(start: Point, end: Point, here: Point) -> tuple[float, float]:

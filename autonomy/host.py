@@ -92,8 +92,8 @@ class Host:
             self._miss(now_ns)
             return
         try:
-            values = self._call(now_ns)
-        except Exception as error:  # a module may raise anything; it must not harm others
+            payloads = self._call(now_ns)
+        except (Exception, SystemExit) as error:  # a module may raise anything; it must not harm others
             log.warning("%s stopped at cycle %d: %s: %s", self.wire.component, cycle, type(error).__name__, error)
             log.debug("traceback", exc_info=True)
             self._say(ModuleState.FAULT, f"cycle {cycle}: {type(error).__name__}: {error}")
@@ -101,7 +101,7 @@ class Host:
             return
         self._steps += 1
         self._missed = 0
-        self._commit(values, now_ns)
+        self._commit(payloads, now_ns)
         self._say(ModuleState.RUNNING, "")
 
     def _read(self, cycle: int, now_ns: int) -> str:
@@ -124,8 +124,8 @@ class Host:
                 )
         return ""
 
-    def _call(self, now_ns: int) -> list[Record]:
-        """Call the step; returns one value per output, or raises what is wrong."""
+    def _call(self, now_ns: int) -> list[bytes]:
+        """Call the step; returns the payload of each output, or raises what is wrong."""
         module = self.module
         module.t_ns = now_ns
         if not self._started:
@@ -141,8 +141,8 @@ class Host:
                         f"self.{name} is not an output; {type(module).__name__} declares "
                         f"{', '.join(module.outputs)} (start names of your own records with _)"
                     )
-        values = []
-        for name, port, _, is_finite in self._outputs:
+        payloads = []
+        for name, port, writer, is_finite in self._outputs:
             value = module._out.get(port)
             if value is None:
                 raise ModuleError(f"output {name} was not assigned in this step")
@@ -150,10 +150,10 @@ class Host:
                 raise ModuleError(f"output {name} is a {port.cls.__name__}, got {value!r:.60}")
             if not is_finite(value):
                 raise ModuleError(f"output {name} is not finite: {value!r:.100}")
-            values.append(value)
-        return values
+            payloads.append(writer.schema.pack(value))
+        return payloads
 
-    def _commit(self, values: list[Record], now_ns: int) -> None:
+    def _commit(self, payloads: list[bytes], now_ns: int) -> None:
         t_data_ns, causes = now_ns, []
         for name, port, found, _ in self._inputs:
             sample: Sample[Any] | None = self.module.samples.get(name)
@@ -162,8 +162,8 @@ class Host:
             causes.append((found.oid, sample.write))
             t_data_ns = min(t_data_ns, sample.t_data_ns)
         lineage = tuple(causes[:8])
-        for (_, _, writer, _), value in zip(self._outputs, values, strict=True):
-            writer.write(value, t_data_ns, lineage)
+        for (_, _, writer, _), payload in zip(self._outputs, payloads, strict=True):
+            self._store.core.write(writer.index, payload, t_data_ns, lineage)
 
     def _miss(self, now_ns: int) -> None:
         """Hold the outputs for a while, then write the safe ones."""

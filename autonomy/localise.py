@@ -1,9 +1,10 @@
 """Localise: an extended Kalman filter over wheel travel and GPS.
 
 State: x, y, yaw of C in M; the slow error of the GPS receiver east and north (a Gauss-Markov process, so that the
-filter knows that averaging fixes does not remove it); scale errors of the left and right wheel. Prediction by the
-travel of the rear wheels, correction by GPS fixes. A fix is applied at the time at which it was measured: the filter
-goes back there and repeats the travel since.
+filter knows that averaging fixes does not remove it); scale errors of the left and right wheel; the slow error of the
+compass. Prediction by the travel of the rear wheels, correction by GPS fixes and, while nothing pulls at the compass's
+idea of down, by compass headings. A fix is applied at the time at which it was measured: the filter goes back there and
+repeats the travel since.
 
 Sources: Thrun, Burgard, Fox, Probabilistic Robotics, 2005, chapters 5 and 7; Gelb, Applied Optimal Estimation, 1974,
 for the Gauss-Markov state.
@@ -14,13 +15,13 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from autonomy import Input, Module, Output, Param
-from hal.signals import Course, FixQuality, GpsFix, LocalPlane, Odometry, Pose, Site, wrap
+from hal.signals import CompassHeading, Course, FixQuality, GpsFix, LocalPlane, Odometry, Pose, Site, wrap
 
 if TYPE_CHECKING:
     import numpy as np
 
-N = 7
-X, Y, YAW, EAST, NORTH, LEFT, RIGHT = range(N)
+N = 8
+X, Y, YAW, EAST, NORTH, LEFT, RIGHT, COMPASS = range(N)
 
 # Receiver errors by kind of fix, as its data sheet gives them: slow sigma m, correlation time s, white sigma m.
 RECEIVER = {
@@ -32,6 +33,7 @@ RECEIVER = {
 UNKNOWN_RECEIVER = (5.0, 300.0, 0.5)
 HISTORY_S = 0.6  # how far back a late fix may lie
 GATE = 30.0  # squared Mahalanobis distance; a good fix exceeds it once in three million
+COMPASS_SIGMA_RAD, COMPASS_TAU_S, COMPASS_WHITE_RAD = 0.06, 15.0, 0.02  # deviation and currents, on a steel cart
 REFUSE_AT_MOST = 10  # then it is the filter that is wrong
 
 
@@ -52,15 +54,19 @@ class Localise(Module):
     course = Input(Course, static=True, optional=True)
     gps = Input(GpsFix, static=True, optional=True)
     odometry = Input(Odometry, optional=True, max_age_s=0.5)
+    compass = Input(CompassHeading, static=True, optional=True, max_age_s=0.5)
     pose = Output(Pose, safe=Pose(sigma_m=1e3))
 
     track_m = Param(0.90, unit="m")
     antenna_x_m = Param(0.60, unit="m")
-    slip = Param(0.01, unit="m/sqrt(m)")
-    yaw_slip = Param(0.002, unit="rad/sqrt(m)")
-    yaw_floor_rad = Param(0.007, unit="rad")
+    # Creep of the rear tyres: 0.05 m sideways on a course of 120 m with four corners, for slip angles of 2 degrees.
+    slip = Param(0.005, unit="m/sqrt(m)")
+    yaw_slip = Param(0.0005, unit="rad/sqrt(m)")
+    # Two counters, each right to a tick of 10.9 mm, evenly: sqrt(2) * 0.0109 / sqrt(12) / track_m.
+    yaw_floor_rad = Param(0.005, unit="rad")
     wheel_sigma = Param(0.005, unit="1")
     drift_mps = Param(0.5, unit="m/sqrt(s)")
+    quiet_mps2 = Param(0.25, unit="m/s2")
 
     def reset(self) -> None:
         """Start knowing nothing."""
@@ -70,10 +76,13 @@ class Localise(Module):
         self._np, self._identity = np, np.eye(N)
         self._kf = ExtendedKalmanFilter(dim_x=N, dim_z=2)
         self._kf.x = np.zeros(N)
-        self._kf.P = np.diag([1e8, 1e8, math.pi**2, 0.0, 0.0, self.wheel_sigma**2, self.wheel_sigma**2])
+        self._kf.P = np.diag(
+            [1e8, 1e8, math.pi**2, 0.0, 0.0, self.wheel_sigma**2, self.wheel_sigma**2, COMPASS_SIGMA_RAD**2]
+        )
         self._past: deque[Travelled] = deque(maxlen=max(2, int(HISTORY_S / self.dt_s)))
         self._last: Odometry | None = None
-        self._fix_write = 0
+        self._fix_write = self._heading_write = 0
+        self._speed_mps = 0.0
         self._fix_ns: int | None = None
         self._refused = 0
         self._begun = False
@@ -94,6 +103,7 @@ class Localise(Module):
         if dt_s > 0:
             self._travel(t_ns, left_m, right_m)
         self._take_fix()
+        self._take_heading(left_m, right_m, dt_s)
         self.pose = self._estimate(left_m, right_m, dt_s)
 
     def _begin(self) -> None:
@@ -110,7 +120,7 @@ class Localise(Module):
     def _predict(self, dt_s: float, left_m: float, right_m: float) -> None:
         kf = self._kf
         _, tau_s, _ = self._receiver
-        x_m, y_m, yaw, east_m, north_m, left_scale, right_scale = kf.x.tolist()
+        x_m, y_m, yaw, east_m, north_m, left_scale, right_scale, compass = kf.x.tolist()
         left, right = left_m * (1.0 + left_scale), right_m * (1.0 + right_scale)
         ds, dyaw = (left + right) / 2, (right - left) / self.track_m
         c, s = math.cos(yaw + dyaw / 2), math.sin(yaw + dyaw / 2)
@@ -123,27 +133,44 @@ class Localise(Module):
             F[Y, wheel] = m * s / 2 + ds * c * turn / 2
             F[YAW, wheel] = turn
         F[EAST, EAST] = F[NORTH, NORTH] = keep
+        F[COMPASS, COMPASS] = keep_compass = math.exp(-dt_s / COMPASS_TAU_S)
         slow = self._receiver[0] ** 2 * (1.0 - keep * keep) if self._quality else 0.0
         along, turn = self.slip**2 * abs(ds), self.yaw_slip**2 * abs(ds)
         if self._last is None:  # no wheels: the cart may be anywhere that it could have walked to
             along = self.drift_mps**2 * dt_s
         kf.x = self._np.array(
-            [x_m + ds * c, y_m + ds * s, yaw + dyaw, east_m * keep, north_m * keep, left_scale, right_scale]
+            [
+                x_m + ds * c,
+                y_m + ds * s,
+                yaw + dyaw,
+                east_m * keep,
+                north_m * keep,
+                left_scale,
+                right_scale,
+                compass * keep_compass,
+            ]
         )
         kf.P = F @ kf.P @ F.T
-        kf.P.flat[:: N + 1] += (along, along, turn, slow, slow, 0.0, 0.0)
+        kf.P.flat[:: N + 1] += (
+            along,
+            along,
+            turn,
+            slow,
+            slow,
+            0.0,
+            0.0,
+            COMPASS_SIGMA_RAD**2 * (1.0 - keep_compass**2),
+        )
 
     def _take_fix(self) -> None:
         sample = self.samples.get("gps")
         if sample is None or self.gps is None or sample.write == self._fix_write or self.gps.mode < 2:
             return
         self._fix_write = sample.write
-        if self.gps.quality != self._quality:
-            self._change_receiver(self.gps.quality)
         self._apply_at(sample.t_data_ns)
 
     def _change_receiver(self, quality: FixQuality) -> None:
-        """Another kind of fix has another slow error, of which nothing is known yet."""
+        """Another kind of fix has another slow error, of which nothing is known yet; nothing older can come."""
         kf = self._kf
         self._quality, self._receiver = quality, RECEIVER.get(quality, UNKNOWN_RECEIVER)
         for k in (EAST, NORTH):
@@ -164,6 +191,9 @@ class Localise(Module):
             part = (t_ns - self._now_ns) / (end_ns - self._now_ns)
             self._travel(t_ns, part * left_m, part * right_m)
             again.append((end_ns, (1.0 - part) * left_m, (1.0 - part) * right_m))
+        assert self.gps is not None
+        if self.gps.quality != self._quality:
+            self._change_receiver(self.gps.quality)
         self._correct()
         self._fix_ns = t_ns
         for end_ns, left_m, right_m in reversed(again):
@@ -192,6 +222,26 @@ class Localise(Module):
             return
         self._refused = 0
         kf.update(z, HJacobian=lambda _: H, Hx=lambda _: expected, R=R)
+
+    def _take_heading(self, left_m: float, right_m: float, dt_s: float) -> None:
+        """Correct by a new compass heading, if the cart neither turns nor brakes: a tilted compass shows anything."""
+        sample, speed_before_mps = self.samples.get("compass"), self._speed_mps
+        if self.odometry is None or dt_s <= 0:
+            return
+        self._speed_mps += 0.2 * (self.odometry.speed_mps - self._speed_mps)  # ticks are coarse: about five steps
+        along_mps2 = (self._speed_mps - speed_before_mps) / dt_s
+        aside_mps2 = self._speed_mps * (right_m - left_m) / self.track_m / dt_s
+        if sample is None or self.compass is None or sample.write == self._heading_write or not self.compass.valid:
+            return
+        self._heading_write = sample.write
+        if math.hypot(along_mps2, aside_mps2) > self.quiet_mps2:
+            return
+        np, kf = self._np, self._kf
+        H = np.zeros((1, N))
+        H[0, YAW] = H[0, COMPASS] = 1.0
+        expected = kf.x[YAW] + kf.x[COMPASS]
+        miss = wrap(self.compass.yaw_rad - expected)
+        kf.update(np.array([miss]), HJacobian=lambda _: H, Hx=lambda _: np.zeros(1), R=np.eye(1) * COMPASS_WHITE_RAD**2)
 
     def _estimate(self, left_m: float, right_m: float, dt_s: float) -> Pose:
         x, P = self._kf.x, self._kf.P

@@ -133,9 +133,13 @@ class Module(ABC):
         cls.outputs = {name: port for name, port in ports if isinstance(port, OutputPort)}
         cls.params = {name: port for name, port in ports if isinstance(port, ParamPort)}
 
-    def __init__(self) -> None:
-        self._out: dict[OutputPort[Any], Record] = {}
-        self.samples = {}
+    _out: dict[OutputPort[Any], Record]
+
+    def __new__(cls) -> Self:
+        """Make what the host needs, so that a subclass may have an `__init__` that does not call this one's."""
+        module = super().__new__(cls)
+        module._out, module.samples = {}, {}
+        return module
 
     def reset(self) -> None:  # noqa: B027 - a module without memory needs none
         """Prepare for a drive; called once before the first step, with parameters and rng set."""

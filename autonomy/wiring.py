@@ -63,13 +63,18 @@ def load_stack(path: Path) -> Stack:
         raise ModuleError(f"{path}: not JSON: {error}") from error
     if not isinstance(raw, dict) or not isinstance(raw.get(ACTUATORS), dict):
         raise ModuleError(f'{path}: a stack is one object with an entry "{ACTUATORS}" that names the command to obey')
-    return Stack(
-        tuple(_wire(path, name, entry) for name, entry in raw.items() if name != ACTUATORS),
-        str(raw[ACTUATORS]["inputs"]["drive"]),
-    )
+    pointers = raw[ACTUATORS].get("inputs")
+    command = pointers.get("drive") if isinstance(pointers, dict) else None
+    if not isinstance(command, str):
+        raise ModuleError(f'{path}: {ACTUATORS}: expected {{"inputs": {{"drive": "component/object"}}}}')
+    return Stack(tuple(_wire(path, name, entry) for name, entry in raw.items() if name != ACTUATORS), command)
 
 
-def _wire(path: Path, name: str, entry: dict[str, Any]) -> Wire:
+def _wire(path: Path, name: str, entry: Any) -> Wire:
+    if not isinstance(entry, dict):
+        raise ModuleError(
+            f"{path}: {name}: an entry is an object with module, every, phase and inputs, got {entry!r:.60}"
+        )
     unknown = set(entry) - {"module", "every", "phase", "inputs", "params"}
     if unknown:
         raise ModuleError(
@@ -80,7 +85,13 @@ def _wire(path: Path, name: str, entry: dict[str, Any]) -> Wire:
         wire = Wire(name, entry["module"], entry["every"], entry["phase"], entry["inputs"], entry.get("params", {}))
     except KeyError as error:
         raise ModuleError(f"{path}: {name}: the key {error} is missing") from error
-    if not (isinstance(wire.every, int) and isinstance(wire.phase, int) and 0 <= wire.phase < wire.every):
+    if not isinstance(wire.module, str):
+        raise ModuleError(f"{path}: {name}: module is package.module:Class or FILE.py:Class, got {wire.module!r:.60}")
+    if not (isinstance(wire.inputs, dict) and all(isinstance(pointer, str) for pointer in wire.inputs.values())):
+        raise ModuleError(f'{path}: {name}: inputs are {{"input": "component/object"}}, got {wire.inputs!r:.60}')
+    if not isinstance(wire.params, dict):
+        raise ModuleError(f'{path}: {name}: params are {{"parameter": value}}, got {wire.params!r:.60}')
+    if not (type(wire.every) is type(wire.phase) is int and 0 <= wire.phase < wire.every):
         raise ModuleError(
             f"{path}: {name}: every and phase are whole ticks with 0 <= phase < every, "
             f"got every={wire.every!r} phase={wire.phase!r}"
@@ -97,7 +108,7 @@ def load_module(spec: str) -> type[Module]:
         loaded = _from_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
     except ModuleError:
         raise
-    except Exception as error:  # a student's file may raise anything while it is imported
+    except (Exception, SystemExit) as error:  # a student's file may raise anything while it is imported
         raise ModuleError(f"{spec}: {type(error).__name__} while loading it: {error}") from error
     cls = getattr(loaded, name, None)
     if not (isinstance(cls, type) and issubclass(cls, Module)):
@@ -124,7 +135,10 @@ def _from_file(path: Path) -> Any:
 def make_module(wire: Wire) -> Module:
     """Make a module with its parameters set and its wiring checked; ModuleError names what does not fit."""
     cls = load_module(wire.module)
-    module = cls()
+    try:
+        module = cls()
+    except (Exception, SystemExit) as error:  # no step(), or an __init__ that raises
+        raise ModuleError(f"{wire.component}: {wire.module}: {type(error).__name__}: {error}") from error
     for name, value in wire.params.items():
         port = cls.params.get(name)
         if port is None:

@@ -1,6 +1,7 @@
 """Runs the drivers on a store: what devices say becomes objects, the drive command goes out to the nodes.
 
-Objects: gps/fix, odometry/travel, safety/state, actuators/state, actuators/command, and counters of each transport.
+Objects: gps/fix, compass/heading, odometry/travel, safety/state, actuators/state, actuators/command, and counters of each
+transport.
 All are visible at the tick after the one at which they were heard.
 """
 
@@ -8,12 +9,14 @@ from rtdb import HOST_DEPENDENT, Object, Store
 
 from .bus import CanBus
 from .drivers.cart import CartDriver
+from .drivers.compass import CompassDriver
 from .drivers.gps import GpsDriver
 from .limits import Envelope
 from .serial_line import SerialDevice, carry
 from .signals import (
     ActuatorCommand,
     ActuatorState,
+    CompassHeading,
     DriveCommand,
     GpsFix,
     LinkCounters,
@@ -40,6 +43,25 @@ class GpsHost:
             carry(self._device, self.driver, t_ns)
         for fix, t_data_ns in self.driver.poll(t_ns):
             self._fix.write(fix, t_data_ns)
+        if t_ns % COUNTERS_NS == 0:
+            self._counters.write(self.driver.counters, t_ns)
+
+
+class CompassHost:
+    """The compass driver on a store."""
+
+    def __init__(self, store: Store, driver: CompassDriver, device: SerialDevice | None = None) -> None:
+        compass = store.join("compass")
+        self.driver, self._device = driver, device
+        self._heading = compass.insert("heading", CompassHeading, history_s=1.0)
+        self._counters = compass.insert("counters", LinkCounters, every=10, flags=HOST_DEPENDENT, history_s=2.0)
+
+    def step(self, t_ns: int) -> None:
+        """Read the line; commit readings."""
+        if self._device is not None:
+            carry(self._device, self.driver, t_ns)
+        for heading, t_data_ns in self.driver.poll(t_ns):
+            self._heading.write(heading, t_data_ns)
         if t_ns % COUNTERS_NS == 0:
             self._counters.write(self.driver.counters, t_ns)
 

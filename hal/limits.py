@@ -7,7 +7,7 @@ cart; one that would corner too hard is slowed down.
 import math
 from dataclasses import dataclass
 
-from .signals import STOP, DriveCommand, Limit
+from .signals import DriveCommand, Limit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,17 +28,19 @@ def limit(command: DriveCommand | None, origin_age_ns: int, envelope: Envelope) 
 
     origin_age_ns: time since the oldest sensor data behind the command was true.
     """
+    stop = DriveCommand(speed_mps=0.0, steer_rad=0.0, decel_mps2=envelope.max_decel_mps2)
     if command is None:
-        return STOP, Limit.NO_COMMAND
+        return stop, Limit.NO_COMMAND
     if not math.isfinite(command.speed_mps + command.steer_rad + command.decel_mps2):
-        return STOP, Limit.NOT_FINITE
+        return stop, Limit.NOT_FINITE
     if abs(command.steer_rad) > envelope.max_steer_rad:
-        return STOP, Limit.STEER
+        return stop, Limit.STEER
     steer_rad = command.steer_rad
+    stop = DriveCommand(speed_mps=0.0, steer_rad=steer_rad, decel_mps2=envelope.max_decel_mps2)
     if origin_age_ns > envelope.max_origin_age_ns:
-        return DriveCommand(speed_mps=0.0, steer_rad=steer_rad), Limit.STALE
+        return stop, Limit.STALE
     if not -envelope.max_reverse_mps <= command.speed_mps <= envelope.max_speed_mps:
-        return DriveCommand(speed_mps=0.0, steer_rad=steer_rad), Limit.SPEED
+        return stop, Limit.SPEED
     curvature = abs(math.tan(steer_rad)) / envelope.wheelbase_m
     cornering_mps = math.sqrt(envelope.max_lateral_mps2 / curvature) if curvature > 1e-9 else math.inf
     decel_mps2 = min(max(command.decel_mps2, 0.1), envelope.max_decel_mps2)

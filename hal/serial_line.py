@@ -2,8 +2,6 @@
 
 from typing import Any, Protocol
 
-from .drivers.gps import GpsDriver
-
 
 class SerialDevice(Protocol):
     """A simulated device at the far end: bytes at level wire, decoded messages at level direct."""
@@ -14,7 +12,17 @@ class SerialDevice(Protocol):
         """Give what has left the device since the last poll."""
 
 
-def carry(device: SerialDevice, driver: GpsDriver, t_ns: int) -> None:
+class SerialDriver(Protocol):
+    """The host end."""
+
+    def feed(self, data: bytes, t_ns: int) -> None:
+        """Take bytes."""
+
+    def hear(self, sentence: Any, t_ns: int) -> None:
+        """Take a decoded message."""
+
+
+def carry(device: SerialDevice, driver: SerialDriver, t_ns: int) -> None:
     """Move what has arrived by t_ns."""
     sent = device.poll(t_ns)
     if isinstance(sent, bytes):

@@ -14,8 +14,12 @@ from hal.signals import (
     ActuatorCommand,
     ActuatorState,
     CartTruth,
+    Clearance,
     Course,
     FaultEvent,
+    GuardState,
+    Hold,
+    LinkCounters,
     LocalPlane,
     Pose,
     SafetyState,
@@ -226,12 +230,19 @@ def latency_max_s(e: Evidence) -> Measured | None:
 
 @metric("s")
 def brake_delay_s(e: Evidence) -> Measured | None:
-    """From the first fault to the first report of the brake node that it brakes."""
+    """From the first fault to the first report of the brake node's braking that stops the cart."""
     if e.fault_s is None:
         return None
+    braking_s = math.inf
     for row in e.recording.find("actuators/state", ActuatorState):
-        if e.time_s(row) >= e.fault_s and row.value.brake_command > 0.02:
-            return Measured(e.time_s(row) - e.fault_s, e.time_s(row))
+        if e.time_s(row) < e.fault_s:
+            continue
+        if row.value.brake_command < 0.02:
+            braking_s = math.inf
+        elif math.isinf(braking_s):
+            braking_s = e.time_s(row)
+        if row.value.brake_command > 0.2:  # for good
+            return Measured(braking_s - e.fault_s, braking_s)
     return Measured(math.inf)
 
 
@@ -281,3 +292,50 @@ def safety_trips(e: Evidence) -> Measured | None:
     bad = (SystemState.STOPPING, SystemState.FAULT, SystemState.ESTOP)
     trips = [b for a, b in pairwise(states) if a.value.state is SystemState.ENABLED and b.value.state in bad]
     return Measured(len(trips), e.recording.time_s(trips[0].cycle) if trips else None) if states else None
+
+
+@metric("")
+def collisions(e: Evidence) -> Measured | None:
+    """1 if the cart's body touched anything, else 0; where nothing stands about, there is nothing to touch."""
+    rows = e.recording.find("world/clearance", Clearance)
+    hit = next((row for row in rows if row.value.collided), None)
+    if not rows:
+        return Measured(0) if e.truth else None
+    return Measured(1, e.recording.time_s(hit.cycle)) if hit else Measured(0)
+
+
+@metric("m")
+def clearance_min_m(e: Evidence) -> Measured | None:
+    """Smallest distance between the cart's body and anything that it must not touch, at most 5."""
+    rows = e.recording.find("world/clearance", Clearance)
+    if not rows:
+        return None
+    row = min(rows, key=lambda row: row.value.distance_m)
+    return Measured(row.value.distance_m, e.recording.time_s(row.cycle))
+
+
+@metric("s")
+def guard_hold_s(e: Evidence) -> Measured | None:
+    """How long the guard held the cart back, after it had first let it go."""
+    rows = e.recording.find("guard/state", GuardState)
+    held_s, first, free = 0.0, None, False
+    for a, b in pairwise(rows):
+        free = free or a.value.hold is Hold.NONE
+        if free and a.value.hold is not Hold.NONE:
+            held_s += e.recording.time_s(b.cycle) - e.recording.time_s(a.cycle)
+            first = first if first is not None else e.recording.time_s(a.cycle)
+    return Measured(held_s, first) if rows else None
+
+
+@metric("")
+def frames_damaged(e: Evidence) -> Measured | None:
+    """CAN frames that the host refused."""
+    rows = e.recording.find("actuators/counters", LinkCounters)
+    return Measured(rows[-1].value.damaged) if rows else None
+
+
+@metric("s")
+def first_trip_s(e: Evidence) -> Measured | None:
+    """When the safety node first stopped the cart; infinite if it never did."""
+    trips = METRICS["safety_trips"].measure(e)
+    return None if trips is None else Measured(trips.at_s, trips.at_s) if trips.at_s is not None else Measured(math.inf)

@@ -4,34 +4,42 @@ Each tick: the world moves on to the edge, the edge, then recorder, drivers and 
 tick together: `cart` is all that modules can know, `world` is the truth and stays private to this process.
 """
 
+import gc
 import logging
-import math
 import os
 import time
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, Self
 
-import numpy as np
-
 from autonomy.host import Host
 from autonomy.process import spawn
 from autonomy.wiring import Stack, load_stack
 from hal.bus import Level
+from hal.drivers.compass import CompassDriver
 from hal.drivers.gps import GpsDriver
-from hal.faults import HostSilence
-from hal.host import CartHost, GpsHost
-from hal.signals import CartTruth, Course, DriveCommand, FaultEvent, FollowState, SystemState
+from hal.host import CartHost, CompassHost, GpsHost
+from hal.signals import (
+    ActorsTruth,
+    CartTruth,
+    Clearance,
+    Course,
+    DriveCommand,
+    FaultEvent,
+    FollowState,
+    Scan,
+    Scene,
+    SystemState,
+)
 from hal.signals import Site as SiteRecord
 from rtdb import STATIC, Store
 from rtdb.recorder import Recorder
-from sim.cart import GPS_LATENCY_NS, Outage, SimCart
-from sim.cart import Start as TrueStart
+from sim.cart import GPS_LATENCY_NS, SimCart
 
-from .scenario import GpsOutageFault, HostSilenceFault, Scenario
+from . import plan
+from .scenario import Scenario
 from .version import version
 
 if TYPE_CHECKING:
@@ -66,6 +74,7 @@ class Drive:
         self.stack = setup.stack or load_stack(scenario.stack_path())
         self._children: list[subprocess.Popen[str]] = []
         self._hosts: list[Host] = []
+        self.sim: SimCart = None  # type: ignore[assignment]  # until assembled
         name = setup.db or (f"drive-{os.getpid()}" if setup.placement == "process" else None)
         self.cart = Store.create(name, tick_ns=TICK_NS, t0_ns=scenario.t0_ns, size=STORE_BYTES)
         self.world = Store.create(None, tick_ns=TICK_NS, t0_ns=scenario.t0_ns)
@@ -77,46 +86,26 @@ class Drive:
 
     # -- assembly -------------------------------------------------------------------------------------------------
 
-    def _rng(self, name: str) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence([self.setup.seed, zlib.crc32(name.encode())]))
-
     def _assemble(self, name: str | None) -> None:
-        scenario, site = self.setup.scenario, self.setup.scenario.load_site()
+        scenario, rng = self.setup.scenario, plan.rng_of(self.setup.seed)
+        site = scenario.load_site()
         self.cart.join("clock")
-        world = self.world.join("world")
-        self._truth = world.insert("cart", CartTruth, every=2)
-        self._fault = world.insert("fault", FaultEvent, history_s=0.1)
-        self._events = self._plan_faults()
-        self._write_mission()
-        t0_ns, mark = scenario.t0_ns, scenario.start
-        drawn = self._rng("start").normal(size=3)
-        start = TrueStart(
-            x_m=mark.east_m + mark.position_sigma_m * drawn[0],
-            y_m=mark.north_m + mark.position_sigma_m * drawn[1],
-            yaw_rad=math.radians(mark.yaw_deg + mark.yaw_sigma_deg * drawn[2]),
-        )
-        outages = tuple(
-            Outage(_at(t0_ns, f.at_s), _at(t0_ns, f.at_s + f.for_s))
-            for f in scenario.faults
-            if isinstance(f, GpsOutageFault)
-        )
-        self.sim = SimCart(
-            level=self.setup.level,
-            t_ns=t0_ns,
-            start=start,
-            plane=site.plane,
-            alt_m=site.alt_m,
-            friction=site.friction,
-            gps_grade=scenario.gps.grade,
-            gps_rng=self._rng("gps"),
-            wheel_rng=self._rng("wheels"),
-            outages=outages,
-        )
-        self.sim.bus.faults += [
-            HostSilence(_at(t0_ns, f.at_s)) for f in scenario.faults if isinstance(f, HostSilenceFault)
-        ]
-        self.gps = GpsHost(self.cart, GpsDriver(GPS_LATENCY_NS), self.sim.gps)
+        self._write_mission(plan.site_record(site), plan.course_record(scenario, site, rng))
+        self.sim = SimCart(plan.sim_setup(scenario, site, self.setup.level, rng), rng)
+        self.sim.bus.faults += plan.bus_faults(scenario, rng)
+        self._events = plan.fault_events(scenario)
+        self._write_world()
+        self._drivers: list[GpsHost | CompassHost] = [GpsHost(self.cart, GpsDriver(GPS_LATENCY_NS), self.sim.gps)]
+        if self.sim.compass is not None:
+            self._drivers.append(CompassHost(self.cart, CompassDriver(self.sim.declination_rad), self.sim.compass))
+        self._scan = self.cart.join("laser").insert("scan", Scan, history_s=0.5) if scenario.laser else None
         self.hal = CartHost(self.cart, self.sim.bus)
+        self._start_modules(name)
+        self.hal.obey(self.cart.find(self.stack.command, DriveCommand))
+        self._finished_s = 0.0
+        self._follow = self.cart.find("follow/state", FollowState) if self._has("follow/state", FollowState) else None
+
+    def _start_modules(self, name: str | None) -> None:
         if self.setup.placement == "inline":
             self._hosts = [Host(self.cart, wire, self.setup.seed) for wire in self.stack.wires]
             for host in self._hosts:
@@ -125,9 +114,6 @@ class Drive:
             assert name is not None
             self._children.append(spawn(name, self.stack.wires, self.setup.seed))
         self._wait_for_stack()
-        self.hal.obey(self.cart.find(self.stack.command, DriveCommand))
-        self._finished_s = 0.0
-        self._follow = self.cart.find("follow/state", FollowState) if self._has("follow/state", FollowState) else None
 
     def _has(self, name: str, cls: type[FollowState]) -> bool:
         return any(obj.name == name and obj.schema.name == cls.__name__ for obj in self.cart.objects())
@@ -146,34 +132,19 @@ class Drive:
                 raise RuntimeError(f"{', '.join(sorted(missing))} did not come within {PARTICIPANT_S:.0f} s")
             self.cart.core.wait_object(self.cart.core.n_objects(), 100_000_000)
 
-    def _write_mission(self) -> None:
-        scenario, site = self.setup.scenario, self.setup.scenario.load_site()
-        mission, plane, mark = self.cart.join("mission"), site.plane, scenario.start
-        points = scenario.waypoints_geo(site)
-        start_lat_rad, start_lon_rad = plane.to_geo(mark.east_m, mark.north_m)
-        course = Course(
-            tuple(p[0] for p in points),
-            tuple(p[1] for p in points),
-            tuple(p[2] for p in points),
-            scenario.course.speed_mps,
-            start_lat_rad,
-            start_lon_rad,
-            max(mark.position_sigma_m, 0.01),
-            math.radians(mark.yaw_deg),
-            math.radians(max(mark.yaw_sigma_deg, 0.1)),
-        )
-        mission.insert("site", SiteRecord, history_s=0.05, flags=STATIC).write(
-            SiteRecord(site.name, plane.lat_rad, plane.lon_rad, site.alt_m), scenario.t0_ns
-        )
-        mission.insert("course", Course, history_s=0.05, flags=STATIC).write(course, scenario.t0_ns)
+    def _write_mission(self, site: SiteRecord, course: Course) -> None:
+        mission, t0_ns = self.cart.join("mission"), self.cart.t0_ns
+        mission.insert("site", SiteRecord, history_s=0.05, flags=STATIC).write(site, t0_ns)
+        mission.insert("course", Course, history_s=0.05, flags=STATIC).write(course, t0_ns)
 
-    def _plan_faults(self) -> list[tuple[int, FaultEvent]]:
-        t0_ns, events = self.setup.scenario.t0_ns, []
-        for fault in self.setup.scenario.faults:
-            events.append((_at(t0_ns, fault.at_s), FaultEvent(fault.kind, True)))
-            if isinstance(fault, GpsOutageFault):
-                events.append((_at(t0_ns, fault.at_s + fault.for_s), FaultEvent(fault.kind, False)))
-        return sorted(events, key=lambda event: event[0])
+    def _write_world(self) -> None:
+        world = self.world.join("world")
+        self._truth = world.insert("cart", CartTruth, every=2)
+        self._fault = world.insert("fault", FaultEvent, history_s=0.1)
+        self._clearance = world.insert("clearance", Clearance, every=10) if self.sim.world else None
+        self._actors = world.insert("actors", ActorsTruth, every=10) if self.sim.setup.actors else None
+        if self.sim.world:
+            world.insert("scene", Scene, history_s=0.05, flags=STATIC).write(self.sim.scene, self.world.t0_ns)
 
     # -- running --------------------------------------------------------------------------------------------------
 
@@ -186,15 +157,18 @@ class Drive:
         """Do one cycle; True when the drive is over."""
         cart, world = self.cart, self.world
         self.sim.advance(TICK_NS)
-        if cart.cycle % 2:  # shows at the next, even tick: the truth of that very edge
-            self._truth.write(self.sim.truth(), self.sim.t_ns)
+        self._tell_truth(cart.cycle + 1)
         cycle = cart.tick()
         world.tick()
         t_ns = cart.now_ns
         if recorder is not None:
             recorder.record()
-        self.gps.step(t_ns)
+        for driver in self._drivers:
+            driver.step(t_ns)
         self.hal.step(cycle, t_ns)
+        scan = self.sim.scan() if self._scan is not None else None
+        if scan is not None and self._scan is not None:
+            self._scan.write(scan, t_ns)
         for host in self._hosts:
             host.step(cycle)
         while self._events and self._events[0][0] <= t_ns:
@@ -202,6 +176,16 @@ class Drive:
         if self._children and not cart.wait_done(cycle, PARTICIPANT_S):
             raise RuntimeError(f"a module did not finish cycle {cycle} within {PARTICIPANT_S:.0f} s")
         return self._over(cycle)
+
+    def _tell_truth(self, next_cycle: int) -> None:
+        """Write what shows at the coming edge: the truth of that very edge."""
+        if next_cycle % 2 == 0:
+            self._truth.write(self.sim.truth(), self.sim.t_ns)
+        if next_cycle % 10 == 0:
+            if self._clearance is not None:
+                self._clearance.write(self.sim.take_clearance(), self.sim.t_ns)
+            if self._actors is not None:
+                self._actors.write(self.sim.actors(), self.sim.t_ns)
 
     def _over(self, cycle: int) -> bool:
         now_s = self.time_s
@@ -224,6 +208,8 @@ class Drive:
             child.terminate()
             child.wait()
         self._children.clear()
+        if self.sim is not None:  # not assembled to the end
+            self.sim.close()
         self.cart.close()
         self.world.close()
 
@@ -234,10 +220,6 @@ class Drive:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _at(t0_ns: int, t_s: float) -> int:
-    return t0_ns + round(t_s * 1e9)
 
 
 def drive(
@@ -257,6 +239,7 @@ def drive(
     }
     with Drive(setup) as run, Recorder(recording, [run.cart, run.world], metadata) as recorder:
         begun_s = time.monotonic()
+        gc.freeze()  # what the libraries made once is not looked through again and again
         while not run.tick(recorder):
             if pace is not None:
                 time.sleep(max(0.0, begun_s + run.time_s / pace - time.monotonic()))

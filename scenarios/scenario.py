@@ -3,7 +3,7 @@
 import math
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -22,7 +22,7 @@ class ScenarioError(ValueError):
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class StartPoint(_Strict):
@@ -57,12 +57,37 @@ class CoursePlan(_Strict):
 
     speed_mps: float = Field(gt=0.0, le=5.5)
     waypoints: tuple[Waypoint, ...] = Field(min_length=1, max_length=64)
+    hidden: int = Field(default=0, ge=0, le=32, description="way-points drawn from the seed, behind the published ones")
 
 
 class GpsSetup(_Strict):
     """The GPS receiver of this drive."""
 
     grade: Literal["autonomous", "sbas", "rtk_float", "rtk_fixed"] = "sbas"
+
+
+class CompassSetup(_Strict):
+    """The compass of this drive."""
+
+    personality: Literal["hmr3000", "os5000"] = "hmr3000"
+
+
+class LaserSetup(_Strict):
+    """A range scanner on the nose."""
+
+    reach_m: float = Field(default=4.0, gt=0.5, le=30.0)
+    fov_deg: float = Field(default=120.0, gt=10.0, le=270.0)
+    rays: int = Field(default=61, ge=3, le=181)
+
+
+class ActorSetup(_Strict):
+    """Somebody who walks along a path from a time on."""
+
+    kind: Literal["person"] = "person"
+    path_m: tuple[tuple[float, float], ...] = Field(min_length=2, max_length=16)
+    speed_mps: float = Field(default=1.4, gt=0.0, le=4.0)
+    at_s: float = Field(ge=0.0)
+    pauses_s: tuple[float, ...] = Field(default=(), description="how long to stand at each inner point of the path")
 
 
 class HostSilenceFault(_Strict):
@@ -80,7 +105,16 @@ class GpsOutageFault(_Strict):
     for_s: float = Field(gt=0.0)
 
 
-FaultSetup = Annotated[HostSilenceFault | GpsOutageFault, Field(discriminator="kind")]
+class CanCorruptionFault(_Strict):
+    """Some frames on the bus have a flipped bit. Level wire only."""
+
+    kind: Literal["can-corruption"]
+    at_s: float = Field(ge=0.0)
+    for_s: float = Field(gt=0.0)
+    probability: float = Field(gt=0.0, le=1.0)
+
+
+FaultSetup = Annotated[HostSilenceFault | GpsOutageFault | CanCorruptionFault, Field(discriminator="kind")]
 
 
 class Scenario(_Strict):
@@ -94,6 +128,9 @@ class Scenario(_Strict):
     course: CoursePlan
     stack: str = "reference"
     gps: GpsSetup = GpsSetup()
+    compass: CompassSetup = CompassSetup()
+    laser: LaserSetup | None = None
+    actors: tuple[ActorSetup, ...] = Field(default=(), max_length=8)
     faults: tuple[FaultSetup, ...] = ()
     duration_s: float = Field(gt=0.0, le=3600.0)
     seeds: int = Field(1, ge=1, le=10_000)
@@ -198,7 +235,7 @@ def load_yaml(path: Path, model: type[M]) -> M:
 
 
 def _is_tag(key: int | str) -> bool:
-    return key in ("host-silence", "gps-outage")
+    return key in ("host-silence", "gps-outage", "can-corruption")
 
 
 def _line(data: Any, loc: tuple[int | str, ...]) -> int:
@@ -212,15 +249,34 @@ def _line(data: Any, loc: tuple[int | str, ...]) -> int:
     return line
 
 
+def _model_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> type[BaseModel] | None:
+    """Give the model that describes the place `loc` in a file, if there is one."""
+    found = [model]
+    for key in loc:
+        info = model.model_fields.get(str(key))
+        if info is not None:
+            found = _models_in(info.annotation)
+        elif _is_tag(key):
+            found = [m for m in found if key in get_args(m.model_fields["kind"].annotation)]
+        if not found:
+            return None
+        model = found[0]
+    return model
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """List the models in a type such as tuple[Waypoint, ...] or Laser | None."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models_in(part)]
+
+
 def _say(error: Any, model: type[BaseModel]) -> str:
     if error["type"] == "extra_forbidden":
         import difflib
 
-        owner: Any = model
-        for key in error["loc"][:-1]:
-            info = owner.model_fields.get(key) if isinstance(owner, type) and issubclass(owner, BaseModel) else None
-            owner = info.annotation if info else None
-        fields = list(owner.model_fields) if isinstance(owner, type) and issubclass(owner, BaseModel) else []
+        owner = _model_at(model, error["loc"][:-1])
+        fields = list(owner.model_fields) if owner else []
         near = difflib.get_close_matches(str(error["loc"][-1]), fields, n=1)
         return "unknown key" + (
             f"; did you mean {near[0]}?" if near else f"; known are {', '.join(fields)}" if fields else ""

@@ -34,7 +34,7 @@ class World:
             self._compound(range(k, min(k + COMPOUND, len(scene.kind)))) for k in range(0, len(scene.kind), COMPOUND)
         ]
         half = [BODY_LENGTH_M / 2, BODY_WIDTH_M / 2, BODY_HEIGHT_M / 2]
-        self._cart = self._body(self._shape(half))
+        self._cart = self._body(self._shape(half), mass_kg=1.0)  # two bodies without mass never touch
         self._actors: list[tuple[int, ObstacleKind]] = []
         self._collided = False
 
@@ -43,8 +43,8 @@ class World:
             self._bullet.createCollisionShape(self._bullet.GEOM_BOX, halfExtents=half, physicsClientId=self._client)
         )
 
-    def _body(self, shape: int) -> int:
-        return int(self._bullet.createMultiBody(0.0, shape, physicsClientId=self._client))
+    def _body(self, shape: int, mass_kg: float = 0.0) -> int:
+        return int(self._bullet.createMultiBody(mass_kg, shape, physicsClientId=self._client))
 
     def _compound(self, indices: range) -> int:
         s, b = self._scene, self._bullet
@@ -83,6 +83,13 @@ class World:
     def _place(self, body: int, centre: tuple[float, float, float], yaw_rad: float) -> None:
         quaternion = (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
         self._bullet.resetBasePositionAndOrientation(body, centre, quaternion, physicsClientId=self._client)
+
+    def touches(self) -> bool:
+        """Say whether the cart touches anything now; cheap, for every tick."""
+        self._bullet.performCollisionDetection(physicsClientId=self._client)
+        hits = self._bullet.getContactPoints(bodyA=self._cart, physicsClientId=self._client)
+        self._collided = self._collided or any(hit[8] < 0.0 for hit in hits)
+        return self._collided
 
     def clearance(self) -> Clearance:
         """Say how close the cart is to the nearest thing."""
@@ -138,12 +145,11 @@ def load_bullet() -> ModuleType:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    sys.stdout.flush()
-    kept, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(null, 1)
+        os.dup2(null, 2)
         yield
     finally:
-        os.dup2(kept, 1)
+        os.dup2(kept, 2)
         os.close(kept)
         os.close(null)

@@ -4,6 +4,8 @@ A sentence is `$`, an address (talker and type), fields between commas, `*`, two
 the digits are the exclusive or of all bytes between `$` and `*`. An empty field means "unknown", here None.
 Values keep NMEA's own units, which stand in their names; the drivers convert them.
 
+OceanServer's `$C320.5P0.2R-18.3T19.0*3C` is the odd one: letters stand before its values in place of commas.
+
 Each type of sentence is a struct and, as `COLUMNS`, the table of its fields. `parse`, `format` and `quantise`
 all follow that table: `quantise(s)` is what `parse(format(s))` gives, to the last bit and without the text.
 """
@@ -18,6 +20,7 @@ import msgspec
 from hal.codecs import CodecError
 
 __all__ = [
+    "COMPASS_SENTENCES",
     "MAX_LENGTH",
     "SENTENCES",
     "Gga",
@@ -28,6 +31,8 @@ __all__ = [
     "Hdm",
     "Hdt",
     "Hpr",
+    "Ohpr",
+    "Os5000",
     "Rmc",
     "Sentence",
     "SentenceError",
@@ -370,10 +375,31 @@ class _Unit:
         return None
 
 
+class _Reserved:
+    """A field that the maker keeps for itself: read over, written empty."""
+
+    width = 1
+    name = ""
+
+    def read(self, fields: list[str], at: int) -> None:
+        """Take whatever stands there."""
+
+    def write(self, value: None) -> str:
+        return ""
+
+    def quantise(self, value: None) -> None:
+        return None
+
+
 _TIME: Final = _Clock()
 _LATITUDE: Final = _Angle("lat_deg", "NS", 2)
 _LONGITUDE: Final = _Angle("lon_deg", "EW", 3)
 _VARIATION: Final = _Signed("variation_deg", "EW", 1)
+_HEADING: Final = _Course("heading_deg", 1)
+_PITCH: Final = _Number("pitch_deg", 1, -180.0, 180.0)
+_ROLL: Final = _Number("roll_deg", 1, -180.0, 180.0)
+_TEMPERATURE: Final = _Number("temperature_degc", 1, -999.9, 999.9)
+_RESERVED: Final = _Reserved()
 _STATUS: Final = _Text("status")
 _MODE: Final = _Text("mode")
 
@@ -390,6 +416,8 @@ class Sentence(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     """The fewest fields that are accepted: old versions of the standard have fewer."""
     WRITTEN: ClassVar[int]
     """The fewest fields that are written: empty ones after these are left out at the end."""
+    OWN_TALKER: ClassVar[str | None] = None
+    """The one talker of a maker's own sentence."""
 
     talker: str = "GP"
 
@@ -573,7 +601,7 @@ class Hdg(Sentence, frozen=True, gc=False, kw_only=True):
     """Heading of a magnetic sensor; deviation and variation are east positive, to be added."""
 
     TYPE = "HDG"
-    COLUMNS = (_Course("heading_deg", 1), _Signed("deviation_deg", "EW", 1), _VARIATION)
+    COLUMNS = (_HEADING, _Signed("deviation_deg", "EW", 1), _VARIATION)
     ACCEPTED = 1
     WRITTEN = 5
 
@@ -587,7 +615,7 @@ class Hdt(Sentence, frozen=True, gc=False, kw_only=True):
     """Heading from true north."""
 
     TYPE = "HDT"
-    COLUMNS = (_Course("heading_deg", 1), _Unit("T"))
+    COLUMNS = (_HEADING, _Unit("T"))
     ACCEPTED = WRITTEN = 2
 
     talker: str = "HC"
@@ -598,7 +626,7 @@ class Hdm(Sentence, frozen=True, gc=False, kw_only=True):
     """Heading from magnetic north."""
 
     TYPE = "HDM"
-    COLUMNS = (_Course("heading_deg", 1), _Unit("M"))
+    COLUMNS = (_HEADING, _Unit("M"))
     ACCEPTED = WRITTEN = 2
 
     talker: str = "HC"
@@ -609,12 +637,13 @@ class Hpr(Sentence, frozen=True, gc=False, kw_only=True):
     """Heading, pitch and roll of Honeywell's HMR3000: `$PTNTHPR`. Status N is normal, P and L are alarms."""
 
     TYPE = "TNTHPR"
+    OWN_TALKER = "P"
     COLUMNS = (
-        _Course("heading_deg", 1),
+        _HEADING,
         _Text("heading_status"),
-        _Number("pitch_deg", 1, -180.0, 180.0),
+        _PITCH,
         _Text("pitch_status"),
-        _Number("roll_deg", 1, -180.0, 180.0),
+        _ROLL,
         _Text("roll_status"),
     )
     ACCEPTED = WRITTEN = 6
@@ -628,7 +657,77 @@ class Hpr(Sentence, frozen=True, gc=False, kw_only=True):
     roll_status: str | None = None
 
 
-SENTENCES: Final[tuple[type[Sentence], ...]] = (Gga, Rmc, Vtg, Gst, Gsa, Zda, Gll, Hdg, Hdt, Hdm, Hpr)
+class Ohpr(Sentence, frozen=True, gc=False, kw_only=True):
+    """Format 2 of OceanServer's OS5000: `$OHPR`.
+
+    A compass says only the values that it is set to, and a value that is off leaves no gap. These are the places
+    when all are on; the factory's setting is the first four.
+    """
+
+    TYPE = "HPR"
+    OWN_TALKER = "O"
+    COLUMNS = (
+        _HEADING,
+        _PITCH,
+        _ROLL,
+        _TEMPERATURE,
+        _Number("depth_ft", 1, -9999.9, 9999.9),
+        _Number("field_mgauss", 1, 0.0, 9999.9),
+        _Number("field_x_mgauss", 1, -9999.9, 9999.9),
+        _Number("field_y_mgauss", 1, -9999.9, 9999.9),
+        _Number("field_z_mgauss", 1, -9999.9, 9999.9),
+        _Number("acceleration_g", 3, 0.0, 9.999),
+        _Number("acceleration_x_g", 3, -9.999, 9.999),
+        _Number("acceleration_y_g", 3, -9.999, 9.999),
+        _Number("acceleration_z_g", 3, -9.999, 9.999),
+        _RESERVED,
+        _Number("gyro_x", 1, -999.9, 999.9),
+        _Number("gyro_y", 1, -999.9, 999.9),
+        _RESERVED,
+        _RESERVED,
+    )
+    ACCEPTED = 3
+    WRITTEN = 4
+
+    talker: str = "O"
+    heading_deg: float | None = None
+    pitch_deg: float | None = None
+    roll_deg: float | None = None
+    temperature_degc: float | None = None
+    depth_ft: float | None = None
+    field_mgauss: float | None = None
+    """Length of the vector that follows."""
+    field_x_mgauss: float | None = None
+    field_y_mgauss: float | None = None
+    field_z_mgauss: float | None = None
+    acceleration_g: float | None = None
+    """Length of the vector that follows."""
+    acceleration_x_g: float | None = None
+    acceleration_y_g: float | None = None
+    acceleration_z_g: float | None = None
+    gyro_x: float | None = None
+    """Of the maker's own unit, as `gyro_y`."""
+    gyro_y: float | None = None
+
+
+class Os5000(Sentence, frozen=True, gc=False, kw_only=True):
+    """Format 1 of OceanServer's OS5000, its factory setting. An unknown value is left out with its letter."""
+
+    TYPE = ""
+    OWN_TALKER = "C"
+    COLUMNS = (_HEADING, _PITCH, _ROLL, _TEMPERATURE)
+    ACCEPTED = WRITTEN = 4
+
+    talker: str = "C"
+    heading_deg: float | None = None
+    pitch_deg: float | None = None
+    roll_deg: float | None = None
+    temperature_degc: float | None = None
+
+
+COMPASS_SENTENCES: Final = (Hdg, Hdt, Hdm, Hpr, Ohpr, Os5000)
+"""Those that tell a heading."""
+SENTENCES: Final[tuple[type[Sentence], ...]] = (Gga, Rmc, Vtg, Gst, Gsa, Zda, Gll, *COMPASS_SENTENCES)
 """Every type of sentence that is decoded."""
 
 
@@ -636,6 +735,7 @@ SENTENCES: Final[tuple[type[Sentence], ...]] = (Gga, Rmc, Vtg, Gst, Gsa, Zda, Gl
 
 _FRAME: Final = re.compile(rb"[$!]([ -#%-)+-~]+)\*([0-9A-Fa-f]{2})(?:\r\n|\r|\n)?").fullmatch
 _is_talker: Final = re.compile(r"(?:[A-OQ-Z0-9][A-Z0-9])?").fullmatch  # P is for makers' own sentences
+_is_os5000: Final = re.compile(r"C([-.0-9]*)(?:P([-.0-9]*))?(?:R([-.0-9]*))?(?:T([-.0-9]*))?").fullmatch
 
 
 class _Layout(msgspec.Struct, frozen=True):
@@ -685,9 +785,12 @@ def parse(line: bytes) -> Sentence | None:
     if int(given, 16) != expected:
         raise SentenceError(f"{line!r}: checksum {given.decode()}, expected {expected:02X}")
     address, *fields = body.decode("ascii").split(",")
+    lettered = None if fields else _is_os5000(address)
+    if lettered is not None:
+        address, fields = "C", list(lettered.groups(""))
     if not address.isalnum():
         raise SentenceError(f"{line!r}: address {address!r}, expected letters and digits")
-    talker = "P" if address[0] == "P" else address[:-3]
+    talker = address[0] if address[0] == "P" or lettered is not None else address[:-3]
     layout = _LAYOUTS.get(address[len(talker) :])
     if layout is None or line[0] != 0x24 or not _may_say(talker, layout.sentence):
         return None
@@ -707,7 +810,7 @@ def parse(line: bytes) -> Sentence | None:
 
 
 def _may_say(talker: str, sentence: type[Sentence]) -> bool:
-    return talker == "P" if sentence is Hpr else _is_talker(talker) is not None
+    return _is_talker(talker) is not None if sentence.OWN_TALKER is None else talker == sentence.OWN_TALKER
 
 
 def format(sentence: Sentence) -> bytes:
@@ -720,6 +823,8 @@ def format(sentence: Sentence) -> bytes:
             texts.append(column.write(getattr(sentence, name) if name else None))
     except ValueError as error:
         raise SentenceError(f"{texts[0]} {name}: {error}") from error
+    if isinstance(sentence, Os5000):
+        return frame("".join(letter + text for letter, text in zip(("", "", *"PRT"), texts, strict=True) if text))
     body = ",".join(texts)
     for _ in range(layout.most - sentence.WRITTEN):
         body = body.removesuffix(",")

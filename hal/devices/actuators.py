@@ -67,7 +67,8 @@ class Node:
                 and not self.watch.tripped
             ),
         )
-        self._armed = self._armed and (asked or not was)
+        if was and not self.enabled:
+            self._armed = False  # a stop is not taken back by frames that come again: idle ones come first
         if self.state is SystemState.READY and not asked:
             self.watch.forgive()
 
@@ -75,7 +76,9 @@ class Node:
         idle = self.watch.idle_streak
         message = self.watch.judge(received)
         if message is not None:
-            if getattr(message, "enable", 0) and idle >= GOOD_BEFORE_ENABLE:
+            if not getattr(message, "enable", 0):
+                self._armed = False
+            elif idle >= GOOD_BEFORE_ENABLE:
                 self._armed = True
             self._asked = message
 
@@ -99,7 +102,7 @@ class SteerNode(Node):
         self._listen(t_ns)
         if self.state is SystemState.OVERRIDE or (self.enabled and not was):
             self.target_rad = angle_rad  # released, or: nothing jumps on entry
-        if self.enabled and isinstance(self._asked, SteerCmd) and self._asked.mode == SteerMode.ANGLE:
+        elif self.enabled and isinstance(self._asked, SteerCmd) and self._asked.mode == SteerMode.ANGLE:
             self.target_rad = self._asked.angle_rad
         if t_ns % REPORT_NS == 0:
             self.port.send(
@@ -160,11 +163,16 @@ class BrakeNode(Node):
 
 
 class DriveNode(Node):
-    """Drive: holds a speed with its own motor encoder (proportional-integral), or gives a torque."""
+    """Drive: holds a speed with its own motor encoder, or gives a torque.
+
+    Proportional-integral about a ramp; the torque that the ramp itself needs is fed forward, so that the integral
+    carries rolling resistance and slope only and does not push the cart past the wanted speed.
+    """
 
     command = ThrottleCmd
     gain_per_mps = 0.5  # ours; settles in about two seconds with the lag of the drive
     integral_per_m = 0.15
+    full_accel_mps2 = 1.3  # at output 1, empty cart: what the ramp's torque is reckoned with
 
     def __init__(self, bus: CanBus) -> None:
         super().__init__(bus, "DRIVE")
@@ -207,14 +215,17 @@ class DriveNode(Node):
         if asked.mode != ThrottleMode.SPEED or not wanted:
             self._integral, self._ramp_mps = 0.0, speed_mps
             return 0.0
-        rise = (asked.accel_limit_mps2 or 1.0) * dt_s
+        rise, before_mps = (asked.accel_limit_mps2 or 1.0) * dt_s, self._ramp_mps
         self._ramp_mps = (
             min(max(wanted, self._ramp_mps - 10.0 * rise), self._ramp_mps + rise)
             if wanted > 0
             else max(min(wanted, self._ramp_mps + 10.0 * rise), self._ramp_mps - rise)
         )
         error = self._ramp_mps - speed_mps
-        self._integral = min(max(self._integral + self.integral_per_m * error * dt_s, -1.0), 1.0)
-        output = self.gain_per_mps * error + self._integral
+        if self._ramp_mps == wanted:  # while the ramp still runs, its lag is no error to learn from
+            self._integral = min(max(self._integral + self.integral_per_m * error * dt_s, -1.0), 1.0)
         low, high = (0.0, 1.0) if wanted > 0 else (-1.0, 0.0)
+        speeding_up = (self._ramp_mps - before_mps) * wanted > 0 and dt_s > 0
+        ramp = (self._ramp_mps - before_mps) / dt_s / self.full_accel_mps2 if speeding_up else 0.0
+        output = self.gain_per_mps * error + self._integral + ramp
         return min(max(output, low), high) if math.isfinite(output) else 0.0

@@ -73,6 +73,7 @@ class SafetyNode:
         self._commands = {m.ID: CommandWatch(ACTUATOR_TIMEOUT_NS) for m in (SteerCmd, BrakeCmd, ThrottleCmd)}
         self._system = CommandWatch(SYSTEM_TIMEOUT_NS)
         self._asked = SystemCmd()
+        self._request_ns: int | None = None  # since when SYSTEM_CMD asks to enable
         self._enable_ns: dict[int, int] = {}  # since when each command asks to be obeyed, after enough idle frames
         self._booted_ns = t_ns + BOOT_NS
         self._cycle, self._cycle_ns = -1, t_ns
@@ -120,9 +121,7 @@ class SafetyNode:
             if received.frame_id == SystemCmd.ID:
                 message = self._system.judge(received)
                 if isinstance(message, SystemCmd):
-                    self._asked = message
-                    if message.cycle != self._cycle:
-                        self._cycle, self._cycle_ns = message.cycle, received.t_ns
+                    self._take(message, received.t_ns)
             elif received.frame_id in self._commands:
                 watch = self._commands[received.frame_id]
                 idle = watch.idle_streak
@@ -145,10 +144,21 @@ class SafetyNode:
         if any(pedals):
             self._free_since_ns = t_ns
 
+    def _take(self, message: SystemCmd, t_ns: int) -> None:
+        if not message.request_enable:
+            self._request_ns = None
+        elif not self._asked.request_enable:
+            self._request_ns = t_ns
+        ahead = (message.cycle - self._cycle) & 0xFFFFFFFF  # while enabled, only forward counts as advancing
+        if self.state is not SystemState.ENABLED or 0 < ahead < 1 << 31:
+            self._cycle, self._cycle_ns = message.cycle, t_ns
+        self._asked = message
+
     # -- decisions ----------------------------------------------------------------------------------------------
 
     def _decide(self, t_ns: int, button: bool) -> SystemState:
-        state, asked = self.state, self._asked
+        state = self.state
+        asked = SystemCmd() if self._system.silent(t_ns) else self._asked  # a dead host clears nothing
         if state is SystemState.ESTOP:
             released = not button and not asked.request_estop and asked.clear_faults
             return self._ready() if released else state
@@ -157,7 +167,8 @@ class SafetyNode:
             return SystemState.ESTOP
         if state is SystemState.OVERRIDE:
             free = t_ns - self._free_since_ns >= OVERRIDE_FREE_NS
-            return self._ready() if free and asked.clear_override else state
+            cleared = self.fault is FaultCode.NONE or asked.clear_faults  # a fault from before is still latched
+            return self._ready() if free and asked.clear_override and cleared else state
         if any(self._override):
             return SystemState.OVERRIDE
         if state is SystemState.INIT:
@@ -174,12 +185,13 @@ class SafetyNode:
     def _ready(self) -> SystemState:
         self.fault, self._estop_source = FaultCode.NONE, EstopSource.NONE
         self._enable_ns.clear()
+        self._request_ns = None
         for watch in (*self._commands.values(), self._system):
             watch.forgive()
         return SystemState.READY
 
     def _may_enable(self, t_ns: int) -> bool:
-        asks = [t_ns] if self._asked.request_enable and not self._system.silent(t_ns) else []
+        asks = [self._request_ns] if self._request_ns is not None and not self._system.silent(t_ns) else []
         asks += [since for frame_id, since in self._enable_ns.items() if not self._commands[frame_id].silent(t_ns)]
         return len(asks) == 1 + len(self._commands) and max(asks) - min(asks) <= ENABLE_WINDOW_NS
 

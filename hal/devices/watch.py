@@ -24,6 +24,8 @@ class CommandWatch:
         """Return the message of a good frame, None for one that is not to be obeyed."""
         t_ns, message = received.t_ns, received.message
         if message is None:
+            if self._counter is not None:
+                self._counter = (self._counter + 1) & 15  # it was one frame: the next good one follows it
             self._refuse(crc=True)
             return None
         silent = self.last_good_ns is None or t_ns - self.last_good_ns > self.timeout_ns

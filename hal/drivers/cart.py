@@ -36,6 +36,7 @@ from .odometry import OdometryDriver
 BURST_NS = 20_000_000
 SYSTEM_NS = 50_000_000
 IDLE_BURSTS = 4  # sent disabled before enabling; the nodes want three good ones
+ASK_BURSTS = 15  # asked for that long without an answer: idle again, as a lost frame may have spoilt the request
 ACCEL_LIMIT_MPS2 = 1.0
 FULL_BRAKE_MPS2 = 5.0  # deceleration at effort 1, empty cart
 HOLD_EFFORT = 0.15
@@ -74,7 +75,7 @@ class CartDriver:
         self._speed_mps = 0.0
         self._steer: SteerRpt | None = None
         self._brake: BrakeRpt | None = None
-        self._idle = 0
+        self._idle = self._asking = 0
         self._enable = False
         self._origin_cycle = 0
         self._received = self._lost = 0
@@ -128,6 +129,9 @@ class CartDriver:
         drive, why = limit(command, t_ns - origin_ns, self.envelope)
         self._origin_cycle = origin_cycle
         self._idle = min(self._idle + 1, IDLE_BURSTS) if self.state is SystemState.READY else 0
+        self._asking = self._asking + 1 if self._enable and self.state is SystemState.READY else 0
+        if self._asking > ASK_BURSTS:
+            self._enable, self._idle = False, 0
         ready = self._idle >= IDLE_BURSTS and why in (Limit.NONE, Limit.LATERAL)
         obeyed = self._enable and self.state in (SystemState.READY, SystemState.ENABLED)
         self._enable = ready or (obeyed and why not in (Limit.NO_COMMAND, Limit.STALE))

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.codecs.nmea import (
+    COMPASS_SENTENCES,
     MAX_LENGTH,
     SENTENCES,
     Gga,
@@ -23,6 +24,8 @@ from hal.codecs.nmea import (
     Hdm,
     Hdt,
     Hpr,
+    Ohpr,
+    Os5000,
     Rmc,
     Sentence,
     SentenceError,
@@ -93,6 +96,14 @@ FIELDS: dict[str, st.SearchStrategy[Any]] = {
     "deviation_deg": number(-360.0, 360.0),
     "pitch_deg": number(-180.0, 180.0),
     "roll_deg": number(-180.0, 180.0),
+    "temperature_degc": number(-999.9, 999.9),
+    "depth_ft": number(-9999.9, 9999.9),
+    "field_mgauss": number(0.0, 9999.9),
+    **{f"field_{axis}_mgauss": number(-9999.9, 9999.9) for axis in "xyz"},
+    "acceleration_g": number(0.0, 9.999),
+    **{f"acceleration_{axis}_g": number(-9.999, 9.999) for axis in "xyz"},
+    "gyro_x": number(-999.9, 999.9),
+    "gyro_y": number(-999.9, 999.9),
 }
 TEXTS = {"station", "status", "mode", "navigation_status", "selection", "system"}
 
@@ -102,7 +113,8 @@ def strategy_of(sentence: type[Sentence]) -> st.SearchStrategy[Sentence]:
     for name in sentence.__struct_fields__:
         is_text = name in TEXTS or name.endswith("_status")
         fields[name] = FIELDS.get(name, text if is_text else number())
-    fields["talker"] = st.just("P") if sentence is Hpr else st.sampled_from(["GP", "GN", "HC", "II", ""])
+    own = sentence.OWN_TALKER
+    fields["talker"] = st.sampled_from(["GP", "GN", "HC", "II", ""]) if own is None else st.just(own)
     if sentence is Gsa:
         fields["satellites"] = st.lists(st.integers(0, 999), max_size=12).map(tuple)
     return st.builds(sentence, **fields)
@@ -292,6 +304,37 @@ def test_receivers_without_a_fix(line: bytes, sentence: Sentence) -> None:
             "PTNTHPR,,P,,P,0.8,N",
             Hpr(heading_status="P", pitch_status="P", roll_deg=0.8, roll_status="N"),
         ),
+        (
+            "C320.5P0.2R-18.3T19.0",
+            Os5000(heading_deg=320.5, pitch_deg=0.2, roll_deg=-18.3, temperature_degc=19.0),
+        ),
+        ("C320.5R-18.3", Os5000(heading_deg=320.5, roll_deg=-18.3)),
+        ("CP0.2", Os5000(pitch_deg=0.2)),
+        ("C", Os5000()),
+        (
+            "OHPR,237.7,-14.3,175.5,30.1",
+            Ohpr(heading_deg=237.7, pitch_deg=-14.3, roll_deg=175.5, temperature_degc=30.1),
+        ),
+        (
+            "OHPR,320.5,0.2,-18.3,19.0,0.0,512.3,-101.5,180.2,468.8,1.002,0.003,-0.314,0.951,,0.1,-0.2,,",
+            Ohpr(
+                heading_deg=320.5,
+                pitch_deg=0.2,
+                roll_deg=-18.3,
+                temperature_degc=19.0,
+                depth_ft=0.0,
+                field_mgauss=512.3,
+                field_x_mgauss=-101.5,
+                field_y_mgauss=180.2,
+                field_z_mgauss=468.8,
+                acceleration_g=1.002,
+                acceleration_x_g=0.003,
+                acceleration_y_g=-0.314,
+                acceleration_z_g=0.951,
+                gyro_x=0.1,
+                gyro_y=-0.2,
+            ),
+        ),
     ],
 )
 def test_sentences_of_all_types(body: str, sentence: Sentence) -> None:
@@ -314,6 +357,17 @@ def test_sentences_of_all_types(body: str, sentence: Sentence) -> None:
             seal("PTNTHPR,85.9,N,-0.9,N,0.0,N"),
         ),
         (Hdg(heading_deg=359.97, variation_deg=-4.71), seal("HCHDG,0.0,,,4.7,W")),
+        (
+            Os5000(heading_deg=320.46, pitch_deg=0.24, roll_deg=-18.3, temperature_degc=19.0),
+            b"$C320.5P0.2R-18.3T19.0*3C",
+        ),
+        (Os5000(heading_deg=359.97, roll_deg=-0.01), seal("C0.0R0.0")),
+        (
+            Ohpr(heading_deg=237.7, pitch_deg=-14.3, roll_deg=175.5, temperature_degc=30.1),
+            b"$OHPR,237.7,-14.3,175.5,30.1*2B",
+        ),
+        (Ohpr(heading_deg=1.0, gyro_y=2.0), seal("OHPR,1.0,,,,,,,,,,,,,,,2.0")),
+        (Ohpr(), seal("OHPR,,,,")),
         (Rmc(status="V"), seal("GPRMC,,V,,,,,,,,,")),
         (Vtg(mode="N"), seal("GPVTG,,T,,M,,N,,K,N")),
         (Gll(), seal("GPGLL,,,,,,")),
@@ -342,6 +396,9 @@ def test_how_sentences_are_written(sentence: Sentence, line: bytes) -> None:
         b"$GPTXT,01,01,02,ANTSTATUS=OK*3B",
         b"$GNDTM,W84,,0.0,N,0.0,E,0.0,W84*71",
         seal("PGGA,1"),
+        seal("C,1,2,3,4"),
+        seal("HCHPR,1.0,2.0,3.0,4.0"),
+        seal("PC"),
         seal("GNGGAX,1"),
         b"!" + seal("AIVDM,1,1,,A,15M,0")[1:],
     ],
@@ -392,6 +449,12 @@ def test_sound_sentences_of_other_types_are_none(line: bytes) -> None:
         (seal("GPGLL,,,,,1200,A"), "time_s"),
         (seal("GPGLL,,,,,,VALID"), "status"),
         (seal("GPZDA,,32,01,2016,,"), "day"),
+        (seal("C360.5P0.2R-18.3T19.0"), "C, field 1 heading_deg"),
+        (seal("C320.5P0.2R-1-8T19.0"), "C, field 3 roll_deg: '-1-8' came"),
+        (seal("C320.5P0.2R-18.3TX"), "address"),
+        (seal("C320.5R0.2P-18.3"), "address"),
+        (seal("OHPR,320.5"), "1 fields, expected 3 to 18"),
+        (seal("OHPR,320.5,X,0.0"), "pitch_deg"),
         (seal("GPHDT,1.0,M"), "field 2 unit: 'M' came, expected T"),
         (seal("GPGSA,A,1,X,,,,,,,,,,,,1,1,1"), "satellites"),
     ],
@@ -399,6 +462,18 @@ def test_sound_sentences_of_other_types_are_none(line: bytes) -> None:
 def test_damaged_lines_are_refused_with_the_reason(line: bytes, complaint: str) -> None:
     with pytest.raises(SentenceError, match=complaint.replace(".", r"\.")):
         parse(line)
+
+
+def test_a_reserved_field_is_read_over() -> None:
+    line = seal("OHPR,1.0,2.0,3.0,4.0,,,,,,,,,,whatever,5.0,6.0,7,8.9")
+    assert parse(line) == Ohpr(
+        heading_deg=1.0, pitch_deg=2.0, roll_deg=3.0, temperature_degc=4.0, gyro_x=5.0, gyro_y=6.0
+    )
+
+
+@pytest.mark.parametrize("sentence", COMPASS_SENTENCES)
+def test_compass_sentences_have_a_heading(sentence: type[Sentence]) -> None:
+    assert "heading_deg" in sentence.__struct_fields__
 
 
 @pytest.mark.parametrize("date", ["2208-1", "000000", "321299", "22081999", "X"])
@@ -433,6 +508,10 @@ def test_decimals_of_the_time_are_the_nearest_float() -> None:
         Gga(talker="P"),
         Gga(talker="GPS"),
         Hpr(talker="HC"),
+        Ohpr(talker="HC"),
+        Ohpr(acceleration_g=10.0),
+        Os5000(talker="GP"),
+        Os5000(pitch_deg=math.nan),
         Rmc(course_deg=-1.0),
         Rmc(variation_deg=math.nan),
         Rmc(date=(31, 13, 20)),

@@ -1,0 +1,111 @@
+"""Plan: what a scenario and a seed mean, as pure functions: start, mission, simulation, faults. Nothing runs here."""
+
+import math
+import zlib
+from collections.abc import Callable
+
+import numpy as np
+
+from hal.bus import Fault, Level
+from hal.faults import Corruption, HostSilence
+from hal.signals import Course, FaultEvent, ObstacleKind
+from hal.signals import Site as SiteRecord
+from sim.actors import Actor
+from sim.cart import Outage, SimSetup, Start
+from sim.laser import LaserParams
+from sim.site import Site
+
+from .course import hidden_course
+from .scenario import CanCorruptionFault, GpsOutageFault, HostSilenceFault, Scenario
+
+Rng = Callable[[str], np.random.Generator]
+
+
+def rng_of(seed: int) -> Rng:
+    """Give one independent generator per name."""
+    return lambda name: np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
+
+
+def at(scenario: Scenario, t_s: float) -> int:
+    """Turn seconds since the start into a stamp."""
+    return scenario.t0_ns + round(t_s * 1e9)
+
+
+def site_record(site: Site) -> SiteRecord:
+    """Give the map's origin."""
+    return SiteRecord(site.name, site.plane.lat_rad, site.plane.lon_rad, site.alt_m)
+
+
+def course_record(scenario: Scenario, site: Site, rng: Rng) -> Course:
+    """Give the course: the published way-points, and behind them the hidden ones of this seed."""
+    plane, mark = site.plane, scenario.start
+    points = [(*plane.to_map(lat, lon), radius) for lat, lon, radius in scenario.waypoints_geo(site)]
+    if scenario.course.hidden:
+        before = points[-2][:2] if len(points) > 1 else (mark.east_m, mark.north_m)
+        last = points[-1]
+        yaw_rad = math.atan2(last[1] - before[1], last[0] - before[0])
+        drawn = hidden_course(site, last[:2], yaw_rad, scenario.course.hidden, rng("course"))
+        points += [(x, y, last[2]) for x, y in drawn]
+    geo = [plane.to_geo(x, y) for x, y, _ in points]
+    start_lat_rad, start_lon_rad = plane.to_geo(mark.east_m, mark.north_m)
+    return Course(
+        tuple(lat for lat, _ in geo),
+        tuple(lon for _, lon in geo),
+        tuple(radius for _, _, radius in points),
+        scenario.course.speed_mps,
+        start_lat_rad,
+        start_lon_rad,
+        max(mark.position_sigma_m, 0.01),
+        math.radians(mark.yaw_deg),
+        math.radians(max(mark.yaw_sigma_deg, 0.1)),
+    )
+
+
+def sim_setup(scenario: Scenario, site: Site, level: Level, rng: Rng) -> SimSetup:
+    """Give the simulated cart: it starts near its mark, as well as the crew puts it there."""
+    mark, drawn, laser = scenario.start, rng("start").normal(size=3), scenario.laser
+    return SimSetup(
+        site=site,
+        start=Start(
+            x_m=mark.east_m + mark.position_sigma_m * drawn[0],
+            y_m=mark.north_m + mark.position_sigma_m * drawn[1],
+            yaw_rad=math.radians(mark.yaw_deg + mark.yaw_sigma_deg * drawn[2]),
+        ),
+        t_ns=scenario.t0_ns,
+        level=level,
+        gps_grade=scenario.gps.grade,
+        outages=tuple(
+            Outage(at(scenario, f.at_s), at(scenario, f.at_s + f.for_s))
+            for f in scenario.faults
+            if isinstance(f, GpsOutageFault)
+        ),
+        compass=scenario.compass.personality,
+        laser=None
+        if laser is None
+        else LaserParams(reach_m=laser.reach_m, fov_rad=math.radians(laser.fov_deg), rays=laser.rays),
+        actors=tuple(
+            Actor(ObstacleKind[a.kind.upper()], a.path_m, a.speed_mps, at(scenario, a.at_s), a.pauses_s) for a in scenario.actors
+        ),
+    )
+
+
+def bus_faults(scenario: Scenario, rng: Rng) -> list[Fault]:
+    """Give what stands on the CAN bus."""
+    out: list[Fault] = []
+    for k, fault in enumerate(scenario.faults):
+        if isinstance(fault, HostSilenceFault):
+            out.append(HostSilence(at(scenario, fault.at_s)))
+        elif isinstance(fault, CanCorruptionFault):
+            end_ns = at(scenario, fault.at_s + fault.for_s)
+            out.append(Corruption(at(scenario, fault.at_s), end_ns, fault.probability, rng(f"corruption{k}")))
+    return out
+
+
+def fault_events(scenario: Scenario) -> list[tuple[int, FaultEvent]]:
+    """Give when faults begin and end, for the recording."""
+    events = []
+    for fault in scenario.faults:
+        events.append((at(scenario, fault.at_s), FaultEvent(fault.kind, True)))
+        if not isinstance(fault, HostSilenceFault):
+            events.append((at(scenario, fault.at_s + fault.for_s), FaultEvent(fault.kind, False)))
+    return sorted(events, key=lambda event: event[0])
