@@ -1,8 +1,8 @@
 """Guard: the last module before the limits. It holds the cart back for obstacles ahead and while lost.
 
 Ahead is the corridor that the commanded steering sweeps. The cart must be able to stop in front of whatever stands in
-it: its speed is cut to what the free distance allows, v^2 = 2 a d. After a hold the way must be free for a while before it
-lets go. Without a range scanner it watches the position alone.
+it: its speed is cut to what the free distance allows, v^2 = 2 a d. After a hold the way must be free for a while before
+it lets go. Without a range scanner it watches the position alone.
 """
 
 import math

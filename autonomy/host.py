@@ -78,7 +78,7 @@ class Host:
             max_age_ns = int(port.max_age_s * 1e9) if port.max_age_s is not None else 1 << 62
             self._inputs.append((name, port, found, max_age_ns))
 
-    def step(self, cycle: int) -> None:
+    def step(self, cycle: int, _t_ns: int = 0) -> None:
         """Run the module if it is due in this cycle."""
         if cycle % self.wire.every != self.wire.phase:
             return

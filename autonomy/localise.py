@@ -194,8 +194,8 @@ class Localise(Module):
         assert self.gps is not None
         if self.gps.quality != self._quality:
             self._change_receiver(self.gps.quality)
-        self._correct()
-        self._fix_ns = t_ns
+        if self._correct():
+            self._fix_ns = t_ns
         for end_ns, left_m, right_m in reversed(again):
             self._travel(end_ns, left_m, right_m)
 
@@ -205,8 +205,8 @@ class Localise(Module):
         self._predict((t_ns - self._now_ns) * 1e-9, left_m, right_m)
         self._now_ns = t_ns
 
-    def _correct(self) -> None:
-        """Correct by the position of the antenna, unless it is too far off to be believed."""
+    def _correct(self) -> bool:
+        """Correct by the position of the antenna; False if it is too far off to be believed."""
         np, kf, gps = self._np, self._kf, self.gps
         assert gps is not None
         z = np.array(self._plane.to_map(gps.lat_rad, gps.lon_rad))
@@ -219,9 +219,10 @@ class Localise(Module):
         miss = z - expected
         if miss @ np.linalg.solve(H @ kf.P @ H.T + R, miss) > GATE and self._refused < REFUSE_AT_MOST:
             self._refused += 1
-            return
+            return False
         self._refused = 0
         kf.update(z, HJacobian=lambda _: H, Hx=lambda _: expected, R=R)
+        return True
 
     def _take_heading(self, left_m: float, right_m: float, dt_s: float) -> None:
         """Correct by a new compass heading, if the cart neither turns nor brakes: a tilted compass shows anything."""

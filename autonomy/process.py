@@ -5,8 +5,10 @@ It attaches to the cart's store alone. It is a participant: the clock waits for 
 
 import json
 import logging
+import random
 import subprocess
 import sys
+import time
 from typing import Any
 
 from rtdb import RtdbError, Store
@@ -16,14 +18,17 @@ from .module import ModuleError
 from .wiring import Wire
 
 CONNECT_S = 30.0
-CLOCK_DEAD_S = 60.0
+MAX_DELAY_S = 0.0005  # of a shuffled run
 
 
-def spawn(store_name: str, wires: tuple[Wire, ...], seed: int) -> "subprocess.Popen[str]":
+def spawn(
+    store_name: str, wires: tuple[Wire, ...], seed: int, delay_seed: int | None = None
+) -> "subprocess.Popen[str]":
     """Start a process for some modules of a stack. It ends by itself when the store is closed."""
     job = {
         "store": store_name,
         "seed": seed,
+        "delay_seed": delay_seed,
         "wires": [
             {
                 "component": w.component,
@@ -49,6 +54,7 @@ def run(job: dict[str, Any]) -> None:
         hosts = [Host(store, Wire(**wire), job["seed"], participant=True) for wire in job["wires"]]
         for host in hosts:
             host.connect(CONNECT_S)
+        delays = random.Random(job["delay_seed"]) if job.get("delay_seed") is not None else None
         cycle = store.cycle
         for host in hosts:
             host.component.done(cycle)
@@ -60,6 +66,8 @@ def run(job: dict[str, Any]) -> None:
                 continue
             for due in range(cycle + 1, now + 1):
                 for host in hosts:
+                    if delays is not None:
+                        time.sleep(delays.random() * MAX_DELAY_S)
                     host.step(due)
                     host.component.done(due)
             cycle = now

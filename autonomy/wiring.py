@@ -111,7 +111,7 @@ def load_module(spec: str) -> type[Module]:
     except (Exception, SystemExit) as error:  # a student's file may raise anything while it is imported
         raise ModuleError(f"{spec}: {type(error).__name__} while loading it: {error}") from error
     cls = getattr(loaded, name, None)
-    if not (isinstance(cls, type) and issubclass(cls, Module)):
+    if not (isinstance(cls, type) and issubclass(cls, Module)) or cls is Module:
         found = [
             n for n, v in vars(loaded).items() if isinstance(v, type) and issubclass(v, Module) and v is not Module
         ]

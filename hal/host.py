@@ -1,8 +1,7 @@
 """Runs the drivers on a store: what devices say becomes objects, the drive command goes out to the nodes.
 
-Objects: gps/fix, compass/heading, odometry/travel, safety/state, actuators/state, actuators/command, and counters of each
-transport.
-All are visible at the tick after the one at which they were heard.
+Objects: gps/fix, compass/heading, odometry/travel, safety/state, actuators/state, actuators/command, and counters of
+each transport. All are visible at the tick after the one at which they were heard.
 """
 
 from rtdb import HOST_DEPENDENT, Object, Store
@@ -37,7 +36,7 @@ class GpsHost:
         self._fix = gps.insert("fix", GpsFix, history_s=1.0)
         self._counters = gps.insert("counters", LinkCounters, every=10, flags=HOST_DEPENDENT, history_s=2.0)
 
-    def step(self, t_ns: int) -> None:
+    def step(self, _cycle: int, t_ns: int) -> None:
         """Read the line; commit finished epochs."""
         if self._device is not None:
             carry(self._device, self.driver, t_ns)
@@ -56,7 +55,7 @@ class CompassHost:
         self._heading = compass.insert("heading", CompassHeading, history_s=1.0)
         self._counters = compass.insert("counters", LinkCounters, every=10, flags=HOST_DEPENDENT, history_s=2.0)
 
-    def step(self, t_ns: int) -> None:
+    def step(self, _cycle: int, t_ns: int) -> None:
         """Read the line; commit readings."""
         if self._device is not None:
             carry(self._device, self.driver, t_ns)

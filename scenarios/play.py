@@ -41,7 +41,7 @@ def play(capture: Path, pace: float | None) -> Iterator[str]:
             cycle, t_ns = store.tick(), store.now_ns
             while arrivals and arrivals[0][0] <= t_ns:
                 gps.driver.feed(arrivals.pop(0)[1], t_ns)
-            gps.step(t_ns)
+            gps.step(cycle, t_ns)
             host.step(cycle)
             sample = fix.visible(cycle)
             if sample is not None and sample.write > seen:

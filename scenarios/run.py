@@ -7,6 +7,7 @@ tick together: `cart` is all that modules can know, `world` is the truth and sta
 import gc
 import logging
 import os
+import random
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from autonomy.host import Host
 from autonomy.process import spawn
-from autonomy.wiring import Stack, load_stack
+from autonomy.wiring import Stack, Wire, load_stack
 from hal.bus import Level
 from hal.drivers.compass import CompassDriver
 from hal.drivers.gps import GpsDriver
@@ -39,6 +40,8 @@ from rtdb.recorder import Recorder
 from sim.cart import GPS_LATENCY_NS, SimCart
 
 from . import plan
+from .by_hand import HandHost, by_hand
+from .course import CourseImpossible
 from .scenario import Scenario
 from .version import version
 
@@ -55,7 +58,11 @@ Placement = Literal["inline", "process"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """How to run a scenario. `db`: name of a shared store, None for a private one; placement: where modules run."""
+    """How to run a scenario.
+
+    db: name of a shared store, None for a private one; placement: where modules run; by_hand: the keyboard drives;
+    shuffle: seed that permutes order, placement over processes and delays, none of which may change the trace.
+    """
 
     scenario: Scenario
     seed: int = 0
@@ -63,6 +70,16 @@ class Setup:
     stack: Stack | None = None
     db: str | None = None
     placement: Placement = "inline"
+    by_hand: bool = False
+    shuffle: int | None = None
+
+
+class DriveError(Exception):
+    """A drive cannot be done, or a part of it is gone. `invalid`: the scenario is to blame, not a module."""
+
+    def __init__(self, message: str, *, invalid: bool) -> None:
+        super().__init__(message)
+        self.invalid = invalid
 
 
 class Drive:
@@ -72,10 +89,15 @@ class Drive:
         self.setup = setup
         scenario = setup.scenario
         self.stack = setup.stack or load_stack(scenario.stack_path())
+        if setup.by_hand:
+            self.stack = by_hand(self.stack)
         self._children: list[subprocess.Popen[str]] = []
+        self._hand: HandHost | None = None
+        self._order = random.Random(setup.shuffle) if setup.shuffle is not None else None  # not part of the drive
         self._hosts: list[Host] = []
         self.sim: SimCart = None  # type: ignore[assignment]  # until assembled
-        name = setup.db or (f"drive-{os.getpid()}" if setup.placement == "process" else None)
+        apart = setup.placement == "process" or setup.shuffle is not None
+        name = setup.db or (f"drive-{os.getpid()}" if apart else None)
         self.cart = Store.create(name, tick_ns=TICK_NS, t0_ns=scenario.t0_ns, size=STORE_BYTES)
         self.world = Store.create(None, tick_ns=TICK_NS, t0_ns=scenario.t0_ns)
         try:
@@ -90,7 +112,11 @@ class Drive:
         scenario, rng = self.setup.scenario, plan.rng_of(self.setup.seed)
         site = scenario.load_site()
         self.cart.join("clock")
-        self._write_mission(plan.site_record(site), plan.course_record(scenario, site, rng))
+        try:
+            course = plan.course_record(scenario, site, rng)
+        except CourseImpossible as error:
+            raise DriveError(str(error), invalid=True) from error
+        self._write_mission(plan.site_record(site), course)
         self.sim = SimCart(plan.sim_setup(scenario, site, self.setup.level, rng), rng)
         self.sim.bus.faults += plan.bus_faults(scenario, rng)
         self._events = plan.fault_events(scenario)
@@ -100,20 +126,33 @@ class Drive:
             self._drivers.append(CompassHost(self.cart, CompassDriver(self.sim.declination_rad), self.sim.compass))
         self._scan = self.cart.join("laser").insert("scan", Scan, history_s=0.5) if scenario.laser else None
         self.hal = CartHost(self.cart, self.sim.bus)
+        if self.setup.by_hand:
+            self._hand = HandHost(self.cart).__enter__()
         self._start_modules(name)
         self.hal.obey(self.cart.find(self.stack.command, DriveCommand))
+        self._work: list[Callable[[int, int], None]] = [
+            *(driver.step for driver in self._drivers),
+            self.hal.step,
+            *([self._write_scan] if self._scan else []),
+            *([self._hand.step] if self._hand else []),
+            *(host.step for host in self._hosts),
+        ]
         self._finished_s = 0.0
         self._follow = self.cart.find("follow/state", FollowState) if self._has("follow/state", FollowState) else None
 
     def _start_modules(self, name: str | None) -> None:
-        if self.setup.placement == "inline":
-            self._hosts = [Host(self.cart, wire, self.setup.seed) for wire in self.stack.wires]
-            for host in self._hosts:
-                host.connect()
-        else:
-            assert name is not None
-            self._children.append(spawn(name, self.stack.wires, self.setup.seed))
+        groups: list[list[Wire]] = [[], [], []]  # the first one here, each other in a process of its own
+        for wire in self.stack.wires:
+            k = self._order.randrange(3) if self._order else int(self.setup.placement == "process")
+            groups[k].append(wire)
+        for k, group in enumerate(groups[1:]):
+            if group and name is not None:
+                delay_seed = None if self.setup.shuffle is None else self.setup.shuffle * 2 + k
+                self._children.append(spawn(name, tuple(group), self.setup.seed, delay_seed))
+        self._hosts = [Host(self.cart, wire, self.setup.seed) for wire in groups[0]]
         self._wait_for_stack()
+        for host in self._hosts:
+            host.connect()
 
     def _has(self, name: str, cls: type[FollowState]) -> bool:
         return any(obj.name == name and obj.schema.name == cls.__name__ for obj in self.cart.objects())
@@ -127,9 +166,10 @@ class Drive:
         }:
             for child in self._children:
                 if child.poll() is not None:
-                    raise RuntimeError(f"the process of {', '.join(sorted(missing))} ended before the drive began")
+                    raise DriveError(f"the process of {', '.join(sorted(missing))} ended at once", invalid=False)
             if time.monotonic() > deadline:
-                raise RuntimeError(f"{', '.join(sorted(missing))} did not come within {PARTICIPANT_S:.0f} s")
+                names = ", ".join(sorted(missing))
+                raise DriveError(f"{names} did not come within {PARTICIPANT_S:.0f} s", invalid=False)
             self.cart.core.wait_object(self.cart.core.n_objects(), 100_000_000)
 
     def _write_mission(self, site: SiteRecord, course: Course) -> None:
@@ -163,19 +203,23 @@ class Drive:
         t_ns = cart.now_ns
         if recorder is not None:
             recorder.record()
-        for driver in self._drivers:
-            driver.step(t_ns)
-        self.hal.step(cycle, t_ns)
-        scan = self.sim.scan() if self._scan is not None else None
-        if scan is not None and self._scan is not None:
-            self._scan.write(scan, t_ns)
-        for host in self._hosts:
-            host.step(cycle)
+        work = self._work
+        if self._order is not None:
+            self._order.shuffle(work)  # all of them read this cut and write for later ones: the order cannot matter
+        for step in work:
+            step(cycle, t_ns)
         while self._events and self._events[0][0] <= t_ns:
             self._fault.write(self._events.pop(0)[1], t_ns)
         if self._children and not cart.wait_done(cycle, PARTICIPANT_S):
-            raise RuntimeError(f"a module did not finish cycle {cycle} within {PARTICIPANT_S:.0f} s")
+            raise DriveError(f"a module did not finish cycle {cycle} within {PARTICIPANT_S:.0f} s", invalid=False)
+        if any(child.poll() is not None for child in self._children):
+            raise DriveError(f"a process of modules ended in cycle {cycle}", invalid=False)
         return self._over(cycle)
+
+    def _write_scan(self, _cycle: int, t_ns: int) -> None:
+        scan = self.sim.scan()
+        if scan is not None and self._scan is not None:
+            self._scan.write(scan, t_ns)
 
     def _tell_truth(self, next_cycle: int) -> None:
         """Write what shows at the coming edge: the truth of that very edge."""
@@ -189,6 +233,8 @@ class Drive:
 
     def _over(self, cycle: int) -> bool:
         now_s = self.time_s
+        if self._hand is not None and self._hand.hand.quit:
+            return True
         standing = abs(self.sim.plant.state.vx_mps) < 0.01
         state = self._follow.visible(cycle) if self._follow is not None and cycle % 10 == 0 else None
         if cycle % 10 == 0:
@@ -208,6 +254,8 @@ class Drive:
             child.terminate()
             child.wait()
         self._children.clear()
+        if self._hand is not None:
+            self._hand.__exit__(None, None, None)
         if self.sim is not None:  # not assembled to the end
             self.sim.close()
         self.cart.close()

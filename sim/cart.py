@@ -91,17 +91,20 @@ class SimCart:
         self.odometry = TickNode(self.bus, per_m * left, per_m * right)
         self._plane: LocalPlane = setup.site.plane
         self.terrain = Terrain(setup.site.hills, setup.site.friction / params.friction)
+        where = self._plane.lat_rad, self._plane.lon_rad, setup.site.alt_m, setup.t_ns
+        self.declination_rad = declination_rad(*where)
         self.gps = GpsReceiver(
-            level=setup.level, t0_ns=setup.t_ns, latency_ns=GPS_LATENCY_NS, sentences=("GGA", "GST", "RMC")
+            level=setup.level,
+            t0_ns=setup.t_ns,
+            latency_ns=GPS_LATENCY_NS,
+            sentences=("GGA", "GST", "RMC"),
+            variation_rad=self.declination_rad,
         )
         self._gps_error = GpsError(rng("gps"), GPS_GRADES[setup.gps_grade])
         self.compass: Compass | None = None
         if setup.compass is not None:
             self.compass = Compass(personality=setup.compass, level=setup.level, t0_ns=setup.t_ns)  # type: ignore[arg-type]
             self._compass_error = CompassError(rng("compass"), CompassParams(cable_gap_m=CABLE_GAP_M))
-            self.declination_rad = declination_rad(
-                self._plane.lat_rad, self._plane.lon_rad, setup.site.alt_m, setup.t_ns
-            )
         boxes = setup.site.all_obstacles()
         heights = {k: self.terrain.height_m(box.east_m, box.north_m) for k, box in enumerate(boxes)}
         self.scene: Scene = scene_of(setup.site, heights)

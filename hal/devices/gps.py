@@ -62,6 +62,7 @@ class GpsReceiver:
         level: Literal["wire", "direct"] = "wire",
         sentences: tuple[str, ...] = ("GGA", "RMC"),
         talker: str = "GP",
+        variation_rad: float | None = None,
         t0_ns: int = 0,
     ) -> None:
         if level not in ("wire", "direct"):
@@ -79,6 +80,7 @@ class GpsReceiver:
         self._direct = level == "direct"
         self._writers = [_WRITERS[name] for name in sentences]
         self._talker = talker
+        self._variation_deg = None if variation_rad is None else math.degrees(variation_rad)
         self._t0_ns = t0_ns
         self._bytes: deque[tuple[int, bytes]] = deque()  # when the last one leaves, those that have not left
         self._sentences: deque[tuple[int, Sentence]] = deque()  # when it is complete
@@ -131,6 +133,7 @@ class GpsReceiver:
             sigma_m=float(sigma_m) if valid else None,
             time_s=centiseconds / 100,
             date=date.fromordinal(_UNIX_DAY + days),
+            variation_deg=self._variation_deg,
         )
         sentences = [write(self._talker, measured) for write in self._writers]
         # Level direct needs the text too, for its length: a sentence is as late as on the wire.
@@ -209,6 +212,8 @@ class _Measurement:
     sigma_m: float | None
     time_s: float
     date: date
+    variation_deg: float | None = None
+    """Magnetic, as the receiver's own model has it; east positive."""
 
     @property
     def speed_kn(self) -> float | None:
@@ -237,6 +242,7 @@ _LONGEST: Final = _Measurement(
     sigma_m=99.99,
     time_s=86_399.99,
     date=date(2026, 12, 31),
+    variation_deg=-179.9,
 )
 """As long as the sentences of a cart get; a longer measurement is refused when it comes."""
 
@@ -264,6 +270,7 @@ def _rmc(talker: str, m: _Measurement) -> Sentence:
         speed_kn=m.speed_kn,
         course_deg=m.course_deg,
         date=(m.date.day, m.date.month, m.date.year % 100) if m.date_known else None,
+        variation_deg=m.variation_deg,
         mode=_MODE_LETTER[m.quality],
     )
 

@@ -41,15 +41,19 @@ ACCEL_LIMIT_MPS2 = 1.0
 FULL_BRAKE_MPS2 = 5.0  # deceleration at effort 1, empty cart
 HOLD_EFFORT = 0.15
 STANDSTILL_MPS = 0.05
+BRAKE_EXCESS_MPS, RELEASE_EXCESS_MPS = 0.25, 0.10
 
 
-def brake_effort(command: DriveCommand, speed_mps: float) -> float:
-    """Decide the brake effort [0, 1] that slows the cart from its measured speed to the commanded one."""
+def brake_effort(command: DriveCommand, speed_mps: float, braking: bool = False) -> float:
+    """Decide the brake effort [0, 1] that slows the cart from its measured speed to the commanded one.
+
+    braking: it brakes already. It begins only when the cart is clearly too fast, and ends when it no longer is.
+    """
     wanted, actual = abs(command.speed_mps), abs(speed_mps)
     if wanted == 0.0 and actual < STANDSTILL_MPS:
         return HOLD_EFFORT
     excess_mps = actual - wanted
-    if excess_mps < 0.15 and wanted > 0.0:
+    if wanted > 0.0 and excess_mps < (RELEASE_EXCESS_MPS if braking else BRAKE_EXCESS_MPS):
         return 0.0
     decel_mps2 = min(command.decel_mps2, 0.3 + 2.0 * excess_mps)
     return min(max(decel_mps2 / FULL_BRAKE_MPS2, 0.0), 1.0)
@@ -76,7 +80,8 @@ class CartDriver:
         self._steer: SteerRpt | None = None
         self._brake: BrakeRpt | None = None
         self._idle = self._asking = 0
-        self._enable = False
+        self._enable = self._braking = False
+        self._steer_rad = 0.0
         self._origin_cycle = 0
         self._received = self._lost = 0
         self._counters: dict[int, int] = {}
@@ -136,13 +141,18 @@ class CartDriver:
         obeyed = self._enable and self.state in (SystemState.READY, SystemState.ENABLED)
         self._enable = ready or (obeyed and why not in (Limit.NO_COMMAND, Limit.STALE))
         enable = self._enable or self.state is SystemState.ENABLED  # the brake of a stale host must still be obeyed
-        effort = brake_effort(drive, self._speed_mps)
+        if why in (Limit.NO_COMMAND, Limit.NOT_FINITE, Limit.STEER):
+            drive = DriveCommand(0.0, self._steer_rad)  # a stop without an angle of its own keeps the last good one
+        self._steer_rad = drive.steer_rad
+        effort = brake_effort(drive, self._speed_mps, self._braking)
+        self._braking = effort > 0.0
+        drive_mps = 0.0 if self._braking else drive.speed_mps  # never against each other
         direction = Direction.FORWARD if drive.speed_mps >= 0 else Direction.REVERSE
         self.port.send(SteerCmd.of(angle_rad=drive.steer_rad, enable=enable), t_ns)
         self.port.send(BrakeCmd.of(effort_ratio=effort, enable=enable), t_ns)
         self.port.send(
             ThrottleCmd.of_speed(
-                speed_mps=drive.speed_mps, accel_limit_mps2=ACCEL_LIMIT_MPS2, enable=enable, direction=direction
+                speed_mps=drive_mps, accel_limit_mps2=ACCEL_LIMIT_MPS2, enable=enable, direction=direction
             ),
             t_ns,
         )
