@@ -8,13 +8,23 @@ import typer
 
 from rtdb.cli import app as db_app
 
+from .cli_regression import register as register_regression
+
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from autonomy.wiring import Stack
+    from rtdb import Store
 
     from .judge import Result
-    from .run import Setup
+    from .run import Observer, Setup
 
 PASS, FAIL, BAD_INPUT, BROKEN, INTERRUPTED = 0, 1, 2, 3, 130
+
+
+class Interrupted(Exception):
+    """Ctrl-C during a drive; the message says what is kept of it."""
+
 
 app = typer.Typer(
     help="Fairway: drive a simulated golf cart, look at it, judge it.",
@@ -25,11 +35,14 @@ app = typer.Typer(
 hal_app = typer.Typer(help="Devices and captures.", no_args_is_help=True)
 app.add_typer(db_app, name="db")
 app.add_typer(hal_app, name="hal")
+register_regression(app)
 
 
 @app.command()
 def drive(
-    scenario: Annotated[str, typer.Argument(help="Scenario id, or path of a .scenario.yaml.")] = "parking-lot/square",
+    scenario: Annotated[
+        str, typer.Argument(help="Scenario id (`fairway ls` lists them), or path of a .scenario.yaml.")
+    ] = "p545/field-trial",
     seed: Annotated[int, typer.Option(help="Seed of all randomness.", min=0)] = 0,
     level: Annotated[str, typer.Option(help="direct (messages) or wire (true bytes).")] = "wire",
     out: Annotated[Path, typer.Option(help="Folder for runs.")] = Path("runs"),
@@ -42,39 +55,60 @@ def drive(
     pace: Annotated[
         float | None, typer.Option(help="Times real time; 1 is real time. Default: as fast as it goes.", min=0.01)
     ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the running drive in rerun, at 4 times real time.")
+    ] = False,
+    by_hand: Annotated[
+        bool, typer.Option("--by-hand", help="Drive with the arrow keys, in real time; q ends the drive.")
+    ] = False,
+    shuffle: Annotated[
+        int | None, typer.Option(help="Permute order, processes and delays by this seed; the trace stays the same.")
+    ] = None,
 ) -> None:
     """Drive a scenario and judge it."""
     from rich.console import Console
 
+    from .cli_regression import after_drive
     from .report import show
     from .run import Setup
     from .scenario import load_scenario
 
     if level not in ("direct", "wire"):
         raise typer.BadParameter(f"{level!r} is not one of direct, wire", param_hint="--level")
+    if by_hand and not sys.stdin.isatty():
+        raise typer.BadParameter("the keyboard is needed: standard input is not a terminal", param_hint="--by-hand")
     plan = load_scenario(scenario)
     stack = _stack(plan.stack_path(), use or [])
     folder = out / plan.id / str(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    setup = Setup(scenario=plan, seed=seed, level=level, stack=stack, db=db)  # type: ignore[arg-type]
+    setup = Setup(
+        scenario=plan, seed=seed, level=level, stack=stack, db=db, by_hand=by_hand, shuffle=shuffle,  # type: ignore[arg-type]
+    )  # fmt: skip
     console = Console()
-    result = _drive(setup, folder, pace, console)
-    show(console, result, folder)
+    if by_hand:
+        console.print(
+            "arrow keys: speed and steering; hold a key or press the space bar to keep going; q ends the drive"
+        )
+        pace = 1.0
+    result = _drive(setup, folder, pace or (4.0 if view else None), console, view)
+    show(console, result)
+    after_drive(console, folder, plan.id, seed)
     raise typer.Exit({"PASS": PASS, "FAIL": FAIL, "UNKNOWN": FAIL}.get(result.verdict, BROKEN))
 
 
-def _drive(setup: "Setup", folder: Path, pace: float | None, console: object) -> "Result":
-    from rich.console import Console
+def _drive(setup: "Setup", folder: Path, pace: float | None, console: "Console", view: bool) -> "Result":
     from rich.progress import BarColumn, Progress, TextColumn
 
     from rtdb.recording import Recording
 
     from .judge import judge
+    from .plots import write_plots
+    from .run import DriveError
     from .run import drive as run_drive
 
     recording = folder / "run.mcap"
-    (folder / "result.json").unlink(missing_ok=True)  # an old verdict must not stand beside a new recording
-    assert isinstance(console, Console)
+    for old in (folder / "result.json", *folder.glob("*.png"), folder / "run.rrd"):
+        old.unlink(missing_ok=True)  # what was derived from an old recording must not stand beside a new one
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -85,15 +119,64 @@ def _drive(setup: "Setup", folder: Path, pace: float | None, console: object) ->
     ) as bar:
         task = bar.add_task(setup.scenario.id, total=setup.scenario.duration_s)
         try:
-            run_drive(setup, recording, pace=pace, progress=lambda t_s: bar.update(task, completed=t_s))
+            lost = run_drive(
+                setup,
+                recording,
+                pace=pace,
+                progress=lambda t_s: bar.update(task, completed=t_s),
+                view=(lambda stores: _look_on(stores, setup)) if view else None,
+            )
         except KeyboardInterrupt:
             bar.stop()
             kept = f"; the recording up to there is in {recording}" if recording.exists() else ""
-            print(f"interrupted{kept}", file=sys.stderr)
-            raise typer.Exit(INTERRUPTED) from None
-    result = judge(Recording(recording), setup.scenario.parsed_criteria)
+            raise Interrupted(f"interrupted{kept}") from None
+        except DriveError as error:
+            bar.stop()
+            print(f"{'INVALID' if error.invalid else 'ERROR'}: {error}", file=sys.stderr)
+            raise typer.Exit(BROKEN) from None
+    whole = Recording(recording)
+    result = judge(whole, setup.scenario.parsed_criteria, broken=lost)
     result.write(folder / "result.json")
+    write_plots(whole, folder, result)
     return result
+
+
+def _look_on(stores: "list[Store]", setup: "Setup") -> "Observer":
+    from .replay import LiveView
+
+    live = LiveView(stores, f"{setup.scenario.id}, seed {setup.seed}")
+    print(live.viewer.address)
+    return live
+
+
+@app.command()
+def replay(
+    run: Annotated[
+        Path | None, typer.Argument(help="Folder of a run, or a .mcap file. Default: the last run in --out.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for runs.")] = Path("runs"),
+    open_it: Annotated[bool, typer.Option("--open/--no-open", help="Open the viewer, or only write run.rrd.")] = True,
+) -> None:
+    """Look at a run in rerun: what the cart saw, believed and did."""
+    import json
+
+    from rtdb.errors import RecordingError
+    from rtdb.recording import Recording
+
+    from .replay import convert, open_viewer
+
+    if run is None:
+        runs = sorted(out.glob("**/run.mcap"), key=lambda p: p.stat().st_mtime)
+        if not runs:
+            raise RecordingError(f"no run in {out}: `fairway drive` makes one")
+        run = runs[-1]
+    mcap = run / "run.mcap" if run.is_dir() else run
+    result = mcap.with_name("result.json")
+    verdict = json.loads(result.read_text()) if result.is_file() else None
+    rrd = convert(Recording(mcap), verdict, mcap.with_suffix(".rrd"))
+    typer.echo(f"{rrd}")
+    if open_it:
+        open_viewer(rrd, typer.echo)
 
 
 def _stack(path: Path, uses: list[str]) -> "Stack":
@@ -147,14 +230,26 @@ def play(
 
 def main() -> None:
     """Run the command; what a user can mend is one line on standard error."""
+    try:
+        _run()
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+
+
+def _run() -> None:
     from autonomy.module import ModuleError
     from hal.errors import HalError
     from rtdb.errors import RtdbError
 
     try:
         app(standalone_mode=True)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+    except SystemExit as done:
+        if done.code == INTERRUPTED:  # typer's way to say that Ctrl-C was pressed outside of a drive
+            raise KeyboardInterrupt from None
+        raise
+    except Interrupted as interrupted:
+        print(interrupted, file=sys.stderr)
         sys.exit(INTERRUPTED)
     except (RtdbError, HalError, ModuleError) as error:
         print(error, file=sys.stderr)

@@ -41,9 +41,10 @@ class Criterion:
             raise ValueError(f"there is no metric {metric}; there are {', '.join(sorted(METRICS))}")
         op, _, number = text.strip().partition(" ")
         try:
-            if op not in OPERATORS:
+            limit = float(number)
+            if op not in OPERATORS or not math.isfinite(limit):
                 raise ValueError
-            return cls(metric, op, float(number))
+            return cls(metric, op, limit)
         except ValueError as error:
             raise ValueError(
                 f'{metric}: expected an operator, a blank and a number, such as "<= 2.0", got {text!r}'
@@ -134,14 +135,14 @@ def faults(recording: Recording) -> list[str]:
     ]
 
 
-def judge(recording: Recording, criteria: tuple[Criterion, ...], *, reason: str = "") -> Result:
-    """Judge a recording. `reason`: why the drive could not be done at all, which makes it INVALID."""
+def judge(recording: Recording, criteria: tuple[Criterion, ...], *, reason: str = "", broken: str = "") -> Result:
+    """Judge a recording. `reason`: why the drive could not be done at all: INVALID; `broken`: what was lost: ERROR."""
     evidence = Evidence(recording)
     metrics = {name: m.measure(evidence) for name, m in METRICS.items()}
     findings = tuple(find(c, metrics[c.metric]) for c in criteria)
-    broken = faults(recording)
+    stopped = [*faults(recording), *([broken] if broken else [])]
     worst = max((list(Verdict).index(f.verdict) for f in findings), default=0)
-    verdict = Verdict.INVALID if reason else Verdict.ERROR if broken else list(Verdict)[worst]
+    verdict = Verdict.INVALID if reason else Verdict.ERROR if stopped else list(Verdict)[worst]
     return Result(
         recording.metadata.get("scenario", ""),
         int(recording.metadata.get("seed", "0")),
@@ -150,5 +151,5 @@ def judge(recording: Recording, criteria: tuple[Criterion, ...], *, reason: str 
         metrics,
         recording.trace_hash(),
         recording.time_s(recording.last_cycle),
-        reason or "; ".join(broken),
+        reason or "; ".join(stopped),
     )

@@ -1,7 +1,6 @@
 """What a drive prints: a table of criteria, and where things are."""
 
 import math
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -33,7 +32,7 @@ def row(finding: Finding) -> tuple[str, ...]:
     return c.metric, value, f"{c.op} {number(c.limit, unit)}", at, f"[{colour}]{finding.verdict}[/{colour}]"
 
 
-def show(console: Console, result: Result, folder: Path) -> None:
+def show(console: Console, result: Result) -> None:
     """Print the result of one drive."""
     table = Table(title=f"{result.scenario}, seed {result.seed}", title_justify="left")
     for heading, justify in (
@@ -52,4 +51,3 @@ def show(console: Console, result: Result, folder: Path) -> None:
     console.print(
         f"[bold {colour}]{result.verdict}[/] after {result.duration_s:.1f} s of driving{reason}", highlight=False
     )
-    console.print(f"recording and result: {folder}", highlight=False, soft_wrap=True)

@@ -10,10 +10,11 @@ import os
 import random
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal, Protocol, Self
 
 from autonomy.host import Host
 from autonomy.process import spawn
@@ -93,6 +94,7 @@ class Drive:
             self.stack = by_hand(self.stack)
         self._children: list[subprocess.Popen[str]] = []
         self._hand: HandHost | None = None
+        self.lost = ""
         self._order = random.Random(setup.shuffle) if setup.shuffle is not None else None  # not part of the drive
         self._hosts: list[Host] = []
         self.sim: SimCart = None  # type: ignore[assignment]  # until assembled
@@ -212,8 +214,8 @@ class Drive:
             self._fault.write(self._events.pop(0)[1], t_ns)
         if self._children and not cart.wait_done(cycle, PARTICIPANT_S):
             raise DriveError(f"a module did not finish cycle {cycle} within {PARTICIPANT_S:.0f} s", invalid=False)
-        if any(child.poll() is not None for child in self._children):
-            raise DriveError(f"a process of modules ended in cycle {cycle}", invalid=False)
+        if not self.lost and any(child.poll() is not None for child in self._children):
+            self.lost = f"a process of modules ended in cycle {cycle}"  # the cart goes on, and its limits stop it
         return self._over(cycle)
 
     def _write_scan(self, _cycle: int, t_ns: int) -> None:
@@ -270,12 +272,28 @@ class Drive:
         self.close()
 
 
-def drive(
-    setup: Setup, recording: Path, *, pace: float | None = None, progress: Callable[[float], None] | None = None
-) -> None:
-    """Drive a scenario from start to end into a recording.
+class Observer(Protocol):
+    """Looks on while a drive is under way: a live view."""
 
-    pace: times real time, None for as fast as it goes; progress: called with the time driven, twice a second of it.
+    def record(self) -> None:
+        """Take what the latest tick made visible."""
+
+    def close(self) -> None:
+        """The drive is over."""
+
+
+def drive(
+    setup: Setup,
+    recording: Path,
+    *,
+    pace: float | None = None,
+    progress: Callable[[float], None] | None = None,
+    view: Callable[[list[Store]], Observer] | None = None,
+) -> str:
+    """Drive a scenario from start to end into a recording; returns what was lost on the way, empty if nothing was.
+
+    pace: times real time, None for as fast as it goes; progress: called with the time driven, twice a second of it;
+    view: makes somebody who looks on.
     """
     scenario = setup.scenario
     metadata = {
@@ -285,11 +303,18 @@ def drive(
         "site": scenario.site,
         "version": version(),
     }
-    with Drive(setup) as run, Recorder(recording, [run.cart, run.world], metadata) as recorder:
+    with Drive(setup) as run, Recorder(recording, [run.cart, run.world], metadata) as recorder, ExitStack() as stack:
+        observer = view([run.cart, run.world]) if view is not None else None
+        if observer is not None:
+            stack.callback(observer.close)
         begun_s = time.monotonic()
         gc.freeze()  # what the libraries made once is not looked through again and again
+        stack.callback(gc.unfreeze)
         while not run.tick(recorder):
+            if observer is not None:
+                observer.record()
             if pace is not None:
                 time.sleep(max(0.0, begun_s + run.time_s / pace - time.monotonic()))
             if progress is not None and run.cart.cycle % 50 == 0:
                 progress(run.time_s)
+        return run.lost
