@@ -1,6 +1,8 @@
 """The `fairway` command. Every import that costs time stands inside a command's body."""
 
 import sys
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,7 +19,8 @@ if TYPE_CHECKING:
     from rtdb import Store
 
     from .judge import Result
-    from .run import Observer, Setup
+    from .replay import LiveView
+    from .run import Setup
 
 PASS, FAIL, BAD_INPUT, BROKEN, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -97,35 +100,57 @@ def drive(
 
 
 def _drive(setup: "Setup", folder: Path, pace: float | None, console: "Console", view: bool) -> "Result":
-    from rich.progress import BarColumn, Progress, TextColumn
-
     from rtdb.recording import Recording
 
     from .judge import judge
     from .plots import write_plots
-    from .run import DriveError
-    from .run import drive as run_drive
 
     recording = folder / "run.mcap"
     for old in (folder / "result.json", *folder.glob("*.png"), folder / "run.rrd"):
         old.unlink(missing_ok=True)  # what was derived from an old recording must not stand beside a new one
-    with Progress(
+    with ExitStack() as shown:
+        lives: list[LiveView] = []
+
+        def look_on(stores: "list[Store]") -> "LiveView":
+            from .replay import LiveView
+
+            lives.append(shown.enter_context(LiveView(stores, f"{setup.scenario.id}, seed {setup.seed}")))
+            print(lives[0].viewer.address, flush=True)
+            return lives[0]
+
+        lost = _run_drive(setup, recording, pace, console, look_on if view else None)
+        whole = Recording(recording)
+        result = judge(whole, setup.scenario.parsed_criteria, broken=lost)
+        result.write(folder / "result.json")
+        write_plots(whole, folder, result)
+        for live in lives:
+            live.show(result)
+            console.print(f"{result.verdict}: look around; close the viewer or press Ctrl-C to go on")
+            live.viewer.wait()
+    return result
+
+
+def _run_drive(
+    setup: "Setup",
+    recording: Path,
+    pace: float | None,
+    console: "Console",
+    view: "Callable[[list[Store]], LiveView] | None",
+) -> str:
+    """Drive under a progress bar; what cannot be done, and Ctrl-C, end the command."""
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    from .run import DriveError, drive
+
+    columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.completed:.0f} of at most {task.total:.0f} s"),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    ) as bar:
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(setup.scenario.id, total=setup.scenario.duration_s)
         try:
-            lost = run_drive(
-                setup,
-                recording,
-                pace=pace,
-                progress=lambda t_s: bar.update(task, completed=t_s),
-                view=(lambda stores: _look_on(stores, setup)) if view else None,
-            )
+            return drive(setup, recording, pace=pace, progress=lambda t_s: bar.update(task, completed=t_s), view=view)
         except KeyboardInterrupt:
             bar.stop()
             kept = f"; the recording up to there is in {recording}" if recording.exists() else ""
@@ -134,19 +159,6 @@ def _drive(setup: "Setup", folder: Path, pace: float | None, console: "Console",
             bar.stop()
             print(f"{'INVALID' if error.invalid else 'ERROR'}: {error}", file=sys.stderr)
             raise typer.Exit(BROKEN) from None
-    whole = Recording(recording)
-    result = judge(whole, setup.scenario.parsed_criteria, broken=lost)
-    result.write(folder / "result.json")
-    write_plots(whole, folder, result)
-    return result
-
-
-def _look_on(stores: "list[Store]", setup: "Setup") -> "Observer":
-    from .replay import LiveView
-
-    live = LiveView(stores, f"{setup.scenario.id}, seed {setup.seed}")
-    print(live.viewer.address)
-    return live
 
 
 @app.command()

@@ -28,6 +28,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from http.client import HTTPConnection, HTTPException
+from importlib.util import find_spec
 from operator import attrgetter
 from pathlib import Path
 from types import TracebackType
@@ -57,7 +58,7 @@ UP_S = 20.0  # how long a viewer may take until it listens
 Colour = tuple[int, int, int]
 Arrays = dict[str, Any]
 TRUE, BELIEVED, WANTED, MEASURED, GREY = (72, 199, 116), (255, 152, 48), (98, 148, 255), (64, 208, 224), (130, 136, 148)
-ALSO_WANTED, SCANNED, RED, YELLOW = (176, 132, 255), (214, 250, 255), (238, 78, 78), (246, 208, 80)
+ALSO_WANTED, SCANNED, RED, YELLOW = (176, 132, 255), (255, 255, 255), (238, 78, 78), (246, 208, 80)
 OBSTACLE_COLOUR: dict[int, Colour] = {
     ObstacleKind.BOX: (168, 128, 88),
     ObstacleKind.CAR: (120, 134, 166),
@@ -121,6 +122,11 @@ LANES = (
     ("ModuleStatus", "state"),
     ("GpsFix", "quality"),
     ("FaultEvent", ""),
+)
+
+
+ALL_TIME = rrb.TimeAxis(
+    view_range=rr.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
 )
 
 
@@ -469,7 +475,7 @@ class Builder:
         if path not in self._last:
             self._last[path] = True
             self.shown.trails.append(path)
-            self._stream.log(path, rr.Points3D.from_fields(radii=0.13, point_shading="flat"), static=True)
+            self._stream.log(path, rr.Points3D.from_fields(radii=0.16, point_shading="flat"), static=True)
         columns = rr.Points3D.columns(
             positions=np.column_stack([x_m, y_m, np.full(len(x_m), 0.12)]),
             colors=np.array([FIX_COLOUR.get(int(q), MEASURED) for q in c["quality"][good]], np.uint8),
@@ -481,17 +487,23 @@ class Builder:
         c, path = table.columns, _path("scene", table.topic)
         if self._last.get(path) != self._believed:
             self._last[path] = self._believed
-            look = rr.Points3D.from_fields(colors=SCANNED, radii=0.1, point_shading="flat")
-            self._stream.log(path, rr.CoordinateFrame(self._believed), look, static=True)
-        points, lengths = [], []
+            look = rr.Points3D.from_fields(colors=SCANNED, radii=0.12, point_shading="flat")
+            rays = rr.LineStrips3D.from_fields(colors=MEASURED, radii=0.012)
+            for entity, archetype in ((path, look), (f"{path}/rays", rays)):
+                self._stream.log(entity, rr.CoordinateFrame(self._believed), archetype, static=True)
+        points, lengths, fans = [], [], []
         for k, ranges in enumerate(c["range_m"]):
             angle = c["first_rad"][k] + c["step_rad"][k] * np.arange(len(ranges))
             seen = ranges < c["max_m"][k]
             x = c["mount_x_m"][k] + ranges * np.cos(angle)
             points.append(np.column_stack([x, ranges * np.sin(angle), np.full(len(x), SCAN_HEIGHT_M)])[seen])
             lengths.append(int(seen.sum()))
+            fan = np.tile([c["mount_x_m"][k], 0.0, SCAN_HEIGHT_M], (2 * lengths[-1] + 1, 1))
+            fan[1::2] = points[-1]  # out and back, ray after ray: one line
+            fans.append(fan)
         columns = rr.Points3D.columns(positions=np.concatenate(points)).partition(lengths)
         self._stream.send_columns(path, self._index(table.cycle), columns)
+        self._stream.send_columns(f"{path}/rays", self._index(table.cycle), rr.LineStrips3D.columns(strips=fans))
 
     def _actors(self, table: Table) -> None:
         c, path = table.columns, _path("scene", table.topic)
@@ -566,7 +578,7 @@ def _drive_tab(shown: _Shown) -> rrb.Container:
         for lane, path in known
         if name in ("", lane)
     ]
-    states = rrb.StateTimelineView(origin="states", contents=[f"+ {path}" for path in lanes], name="States")
+    states = rrb.StateTimelineView(origin="states", contents=_these(lanes), name="States", time_view=ALL_TIME)
     return rrb.Horizontal(
         rrb.Vertical(*_scene_views(shown), row_shares=[3, 2]),
         rrb.Vertical(rrb.TextDocumentView(origin="summary", name="Summary"), states),
@@ -579,11 +591,11 @@ def _drive_tab(shown: _Shown) -> rrb.Container:
 def _scene_views(shown: _Shown) -> list[rrb.Spatial3DView]:
     """The whole course from the south, and the surroundings from behind the cart."""
     low, high = (np.zeros(2), np.ones(2)) if shown.low is None else (shown.low, shown.high)
-    middle, reach = (low + high) / 2, max(float((high - low).max()), 10.0)
-    history = rrb.VisibleTimeRange(
-        "time", start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
-    )
-    trails: dict[Any, Any] = {path: rrb.archetypes.VisibleTimeRanges(history) for path in shown.trails}
+    middle, (width, depth) = (low + high) / 2, (high - low).tolist()
+    reach = max(0.95 * width, depth, 10.0)
+    begin, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    history = [rrb.VisibleTimeRange(timeline, start=begin, end=now) for timeline in ("time", "cycle")]
+    trails: dict[Any, Any] = {path: rrb.VisibleTimeRanges(history) for path in shown.trails}
     common: dict[str, Any] = {
         "contents": "+ /scene/**",
         "overrides": trails,
@@ -608,7 +620,7 @@ def _scene_views(shown: _Shown) -> list[rrb.Spatial3DView]:
         origin=shown.cart or "scene",
         spatial_information=rrb.SpatialInformation(target_frame=f"tf#{shown.cart}") if shown.cart else None,
         eye_controls=rrb.EyeControls3D(
-            kind="orbital", position=(-8.0, 0.0, 5.0), look_target=(4.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
+            kind="orbital", position=(-7.0, 3.0, 5.5), look_target=(4.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
         ),
         **common,
     )
@@ -639,8 +651,16 @@ def _known_plot(
     if not found:
         return None
     return rrb.TimeSeriesView(
-        origin="signals", contents=[f"+ {path}" for _, path, _, _ in found], overrides=overrides, name=title
+        origin="signals",
+        contents=_these(list(overrides)),
+        overrides=overrides,
+        name=title,
+        axis_x=ALL_TIME,
     )
+
+
+def _these(paths: list[str]) -> list[str]:
+    return [f"+ {path}" for path in paths]
 
 
 def _component_tab(shown: _Shown, component: str) -> rrb.Container:
@@ -652,12 +672,15 @@ def _component_tab(shown: _Shown, component: str) -> rrb.Container:
                 by_unit.setdefault(unit, []).append(path)
     views: list[Any] = [
         rrb.TimeSeriesView(
-            origin=_path("signals", component), contents=[f"+ {path}" for path in paths], name=unit or "counts"
+            origin=_path("signals", component),
+            contents=_these(paths),
+            name=unit or "counts",
+            axis_x=ALL_TIME,
         )
         for unit, paths in by_unit.items()
     ]
     if any(topic.partition("/")[0] == component for topic, _ in shown.lanes):
-        views.append(rrb.StateTimelineView(origin=_path("states", component), name="states"))
+        views.append(rrb.StateTimelineView(origin=_path("states", component), name="states", time_view=ALL_TIME))
     return rrb.Grid(*views, name=component)
 
 
@@ -731,7 +754,7 @@ def has_display() -> bool:
 class Viewer:
     """A rerun viewer in a process group of its own, on loopback only: a window, or a server for a browser.
 
-    `address`: where to look; `sink`: where a stream connects to. Ends with `close`.
+    `address`: where to look; `tunnel`: what ssh needs to bring that elsewhere; `sink`: where a stream connects to.
     """
 
     def __init__(self, *files: Path, options: Sequence[str] | None = None) -> None:
@@ -743,18 +766,15 @@ class Viewer:
         page = (
             f"http://127.0.0.1:{web_port}/?url={self.sink.replace('+', '%2B').replace(':', '%3A').replace('/', '%2F')}"
         )
+        self.tunnel = f"-L {web_port}:127.0.0.1:{web_port} -L {port}:127.0.0.1:{port}"
         self.address = page if "--serve-web" in options else "window"
-        script = Path(sys.executable).with_name("rerun")
-        command = str(script) if script.exists() else shutil.which("rerun")
-        if command is None:
-            raise ViewerFailed("the command `rerun` of the package rerun-sdk is not there")
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
         self._process = subprocess.Popen(
-            [command, *map(str, files), "--bind", "127.0.0.1", "--port", str(port), *options],
+            [_program(), *map(str, files), "--bind", "127.0.0.1", "--port", str(port), *options],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=subprocess.STDOUT,
-            start_new_session=True,  # `rerun` is a script around a binary: both must end
+            start_new_session=True,  # Ctrl-C is for us; and a script around the binary must not outlive it
         )
         try:
             self._wait_for(lambda: socket.create_connection(("127.0.0.1", port), timeout=1.0).close())
@@ -792,6 +812,8 @@ class Viewer:
     def close(self) -> None:
         """End the viewer."""
         for number in (signal.SIGTERM, signal.SIGKILL):
+            if self.ended:
+                break
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, number)
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -822,6 +844,17 @@ def _interruptible() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def _program() -> str:
+    """Find the viewer: the binary itself, else the script `rerun` that starts it as its child."""
+    package = find_spec("rerun_cli")
+    binary = Path(package.origin).with_name("rerun") if package and package.origin else Path("rerun")
+    script = Path(sys.executable).with_name("rerun")
+    found = next((str(path) for path in (binary, script) if path.is_file()), None) or shutil.which("rerun")
+    if found is None:
+        raise ViewerFailed("the command `rerun` of the package rerun-sdk is not there")
+    return found
+
+
 def _get(host: str, port: int) -> None:
     with contextlib.closing(HTTPConnection(host, port, timeout=1.0)) as connection:
         connection.request("GET", "/")
@@ -838,6 +871,8 @@ def open_viewer(rrd: Path, say: Callable[[str], object] = print) -> str:
     """Show a rerun file until the window is closed or Ctrl-C; says and returns where to look."""
     with Viewer(rrd) as viewer:
         say(viewer.address)
+        if "SSH_CONNECTION" in os.environ:
+            say(f"from your own machine: ssh {viewer.tunnel} HOST, then open that address there")
         viewer.wait()
         return viewer.address
 

@@ -278,9 +278,6 @@ class Observer(Protocol):
     def record(self) -> None:
         """Take what the latest tick made visible."""
 
-    def close(self) -> None:
-        """The drive is over."""
-
 
 def drive(
     setup: Setup,
@@ -293,7 +290,7 @@ def drive(
     """Drive a scenario from start to end into a recording; returns what was lost on the way, empty if nothing was.
 
     pace: times real time, None for as fast as it goes; progress: called with the time driven, twice a second of it;
-    view: makes somebody who looks on.
+    view: makes somebody who looks on; the caller ends that.
     """
     scenario = setup.scenario
     metadata = {
@@ -305,8 +302,6 @@ def drive(
     }
     with Drive(setup) as run, Recorder(recording, [run.cart, run.world], metadata) as recorder, ExitStack() as stack:
         observer = view([run.cart, run.world]) if view is not None else None
-        if observer is not None:
-            stack.callback(observer.close)
         begun_s = time.monotonic()
         gc.freeze()  # what the libraries made once is not looked through again and again
         stack.callback(gc.unfreeze)
