@@ -73,7 +73,7 @@ class Localise(Module):
         import numpy as np
         from filterpy.kalman import ExtendedKalmanFilter
 
-        self._np, self._identity = np, np.eye(N)
+        self._np, self._F, self._Q = np, np.eye(N), np.zeros((N, N))
         self._kf = ExtendedKalmanFilter(dim_x=N, dim_z=2)
         self._kf.x = np.zeros(N)
         self._kf.P = np.diag(
@@ -125,7 +125,7 @@ class Localise(Module):
         ds, dyaw = (left + right) / 2, (right - left) / self.track_m
         c, s = math.cos(yaw + dyaw / 2), math.sin(yaw + dyaw / 2)
         keep = math.exp(-dt_s / tau_s)
-        F = self._identity.copy()
+        F, Q = self._F, self._Q  # kept from call to call: only what changes is written
         F[X, YAW], F[Y, YAW] = -ds * s, ds * c
         for wheel, m, sign in ((LEFT, left_m, -1.0), (RIGHT, right_m, 1.0)):
             turn = sign * m / self.track_m
@@ -150,17 +150,11 @@ class Localise(Module):
                 compass * keep_compass,
             ]
         )
-        kf.P = F @ kf.P @ F.T
-        kf.P.flat[:: N + 1] += (
-            along,
-            along,
-            turn,
-            slow,
-            slow,
-            0.0,
-            0.0,
-            COMPASS_SIGMA_RAD**2 * (1.0 - keep_compass**2),
-        )
+        Q[X, X] = Q[Y, Y] = along
+        Q[YAW, YAW] = turn
+        Q[EAST, EAST] = Q[NORTH, NORTH] = slow
+        Q[COMPASS, COMPASS] = COMPASS_SIGMA_RAD**2 * (1.0 - keep_compass**2)
+        kf.P = F @ kf.P @ F.T + Q
 
     def _take_fix(self) -> None:
         sample = self.samples.get("gps")
@@ -217,9 +211,12 @@ class Localise(Module):
         expected = np.array([kf.x[X] + kf.x[EAST] + c, kf.x[Y] + kf.x[NORTH] + s])
         R = np.eye(2) * self._receiver[2] ** 2
         miss = z - expected
-        if miss @ np.linalg.solve(H @ kf.P @ H.T + R, miss) > GATE and self._refused < REFUSE_AT_MOST:
-            self._refused += 1
-            return False
+        if miss @ np.linalg.solve(H @ kf.P @ H.T + R, miss) > GATE:
+            if self._refused < REFUSE_AT_MOST:
+                self._refused += 1
+                return False
+            kf.P[: Y + 1, :] = kf.P[:, : Y + 1] = 0.0  # the position is wrong by that much; the yaw need not be
+            kf.P[X, X] = kf.P[Y, Y] = miss @ miss
         self._refused = 0
         kf.update(z, HJacobian=lambda _: H, Hx=lambda _: expected, R=R)
         return True

@@ -44,7 +44,7 @@ class CanPort:
     def __init__(self, bus: "CanBus", name: str, accept: frozenset[int]) -> None:
         self._bus, self.name, self.accept = bus, name, accept
         self._counters: dict[int, int] = {}
-        self._queue: list[Frame] = []
+        self._queue: list[Frame | Received] = []
         self.damaged = 0
 
     def send(self, message: Message, t_ns: int) -> None:
@@ -54,8 +54,8 @@ class CanPort:
         data = encode(message, counter) if self._bus.level == "wire" else message
         self._bus.carry(Frame(t_ns, self.name, message.ID, data, counter))
 
-    def hear(self, frame: Frame) -> None:
-        """Queue a frame from the bus."""
+    def hear(self, frame: "Frame | Received") -> None:
+        """Queue a frame from the bus, or at level direct what was heard."""
         self._queue.append(frame)
 
     def receive(self) -> list[Received]:
@@ -63,11 +63,10 @@ class CanPort:
         if not self._queue:
             return []
         frames, self._queue = self._queue, []
-        return [self._decode(frame) for frame in frames]
+        return [frame if isinstance(frame, Received) else self._decode(frame) for frame in frames]
 
     def _decode(self, frame: Frame) -> Received:
-        if isinstance(frame.data, Message):
-            return Received(frame.t_ns, frame.frame_id, frame.data, frame.counter)
+        assert isinstance(frame.data, bytes)
         try:
             message, counter = decode(frame.frame_id, frame.data)
         except FrameError:
@@ -109,5 +108,10 @@ class CanBus:
             route = self._routes[key] = tuple(
                 p for p in self._ports if frame.frame_id in p.accept and p.name != frame.sender
             )
+        heard = (
+            Received(frame.t_ns, frame.frame_id, frame.data, frame.counter)
+            if isinstance(frame.data, Message)
+            else frame
+        )
         for port in route:
-            port.hear(frame)
+            port.hear(heard)

@@ -25,7 +25,8 @@ from .terrain import Terrain
 from .world import World
 
 STEP_NS = 5_000_000
-CLEARANCE_NS = 50_000_000  # distances are asked for this often, contacts at every tick
+CLEARANCE_NS = 50_000_000  # distances are asked for this often, contacts at every tick once something is near
+FAR_M = 1.0  # cart and walker together do not close this in CLEARANCE_NS
 TICKS_PER_TURN = 128
 STOP_EFFORT = 0.27  # 1.5 m/s2 with an empty cart: the rear axle does not lock, even at friction 0.5
 PARK_EFFORT = 0.4
@@ -114,7 +115,7 @@ class SimCart:
             assert self.world is not None
             self.world.add_actor(actor.kind)
         self._demand = Demand(brake=PARK_EFFORT)
-        self._nearest = Clearance()
+        self._nearest, self._far = Clearance(), False
         self.t_ns = setup.t_ns
         self.estop_button = False
 
@@ -140,12 +141,16 @@ class SimCart:
             self._move_world(self.world, t_ns, s)
 
     def _move_world(self, world: World, t_ns: int, s: CartState) -> None:
+        check = t_ns % CLEARANCE_NS == 0
+        if not check and self._far:
+            return  # nothing can be reached before the next look
         world.move_cart(s.x_m, s.y_m, self.terrain.height_m(s.x_m, s.y_m), s.yaw_rad)
         for k, actor in enumerate(self.setup.actors):
             x_m, y_m, _ = actor.at(t_ns)
             world.move_actor(k, x_m, y_m, self.terrain.height_m(x_m, y_m))
-        if (world.touches() and not self._nearest.collided) or t_ns % CLEARANCE_NS == 0:
+        if (world.touches() and not self._nearest.collided) or check:
             now = world.clearance()
+            self._far = now.distance_m > FAR_M
             if now.collided > self._nearest.collided or now.distance_m <= self._nearest.distance_m:
                 self._nearest = now
 

@@ -215,12 +215,8 @@ class Message(msgspec.Struct, frozen=True, gc=False):
     @classmethod
     def _of(cls, *values: float | None) -> Self:
         """Make a message from SI values in the order of the signals; None means "not available"."""
-        return cls(
-            *[
-                signal.unavailable if value is None else signal.from_si(value)
-                for signal, value in zip(cls.SIGNALS, values, strict=True)
-            ]
-        )
+        make: Callable[..., Self] = _MAKERS[cls]
+        return make(*values)
 
 
 _T = TypeVar("_T", float, "float | None")
@@ -837,6 +833,19 @@ def decode(data):
     return names["encode"], names["decode"]
 
 
+def _compile_maker(message: type[Message]) -> Callable[..., Message]:
+    """Write out, for one message, what each SI value becomes: a loop over the signals would cost twice as much."""
+    names: dict[str, Any] = {"Message": message}
+    terms = []
+    for k, signal in enumerate(message.SIGNALS):
+        names[f"raw{k}"] = signal.from_si
+        term = f"1 if v{k} else 0" if signal.length == 1 else f"raw{k}(v{k})"
+        terms.append(f"{signal.unavailable} if v{k} is None else {term}")
+    arguments = ", ".join(f"v{k}" for k in range(len(terms)))
+    return eval(f"lambda {arguments}: Message({', '.join(terms)})", names)  # type: ignore[no-any-return]
+
+
+_MAKERS: Final[dict[type[Message], Callable[..., Any]]] = {m: _compile_maker(m) for m in MESSAGES.values()}
 _COMPILED: Final = {message: _compile(message) for message in MESSAGES.values()}
 _ENCODERS: Final = {message: pair[0] for message, pair in _COMPILED.items()}
 _DECODERS: Final = {message.ID: pair[1] for message, pair in _COMPILED.items()}

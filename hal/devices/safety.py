@@ -5,6 +5,7 @@ count of wheel ticks, the driver's pedals. The rules and their sources stand in 
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -78,7 +79,7 @@ class SafetyNode:
         self._booted_ns = t_ns + BOOT_NS
         self._cycle, self._cycle_ns = -1, t_ns
         self._ticks, self._moved_ns, self._still_since_ns = 0, t_ns, t_ns
-        self._speeds: list[tuple[int, int]] = []
+        self._speeds: deque[tuple[int, int]] = deque(maxlen=11)
         self._steer_rad = 0.0
         self._torque_since_ns: int | None = None
         self._overspeed_since_ns: int | None = None
@@ -106,8 +107,6 @@ class SafetyNode:
         if ticks != self._ticks:
             self._ticks, self._moved_ns = ticks, t_ns
         self._speeds.append((t_ns, ticks))
-        if len(self._speeds) > 11:
-            del self._speeds[0]
 
     @property
     def speed_mps(self) -> float:
