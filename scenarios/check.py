@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from autonomy.wiring import Stack
 
 ALL_GOOD, FAILED, BROKEN = 0, 1, 3  # exit status, as of `fairway drive`
-MOVES_OF_FAILED = 5
+MOVES_OF_FAILED = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -156,12 +156,12 @@ def show_report(console: "Console", report: "Report") -> None:
     console.print(table)
     bad = [o for o in report.outcomes if not o.good]
     for outcome in report.outcomes:
+        head = f"{outcome.result.scenario} seed {outcome.result.seed}"
         for text in outcome.say_moves():
-            _line(console, f"{outcome.result.scenario} seed {outcome.result.seed}: {text}")
-    for outcome in bad:
-        plots = f" (plots: {', '.join(path.name for path in outcome.plots)})" if outcome.plots else ""
-        _line(console, f"{outcome.result.scenario} seed {outcome.result.seed}: {outcome.task.folder}{plots}")
-        _line(console, f"  look at it: fairway replay {outcome.task.folder}")
+            _line(console, f"{head}: {text}")
+        if not outcome.good:
+            plots = f" and {', '.join(path.name for path in outcome.plots)} there" if outcome.plots else ""
+            _line(console, f"{head}: look at it: fairway replay {outcome.task.folder}{plots}")
     for text in report.updates:
         _line(console, f"golden: {text}")
     total = len(report.outcomes)
@@ -223,7 +223,8 @@ def diff(
             typer.echo(f"{recording.path} ends early: its process was stopped")
     found = first_difference(a, b)
     if found is None:
-        typer.echo(f"same trace: {a.trace_hash()[:16]}, {a.time_s(a.last_cycle):.2f} s")
+        numbers = "" if a.trace_hash() == b.trace_hash() else "; the files number their objects differently"
+        typer.echo(f"same trace: {a.trace_hash()[:16]}, {a.time_s(a.last_cycle):.2f} s{numbers}")
         raise typer.Exit(SAME)
     typer.echo(f"first difference in cycle {found.cycle}, at {found.at_s:.2f} s: {found.topic} {found.field}")
     typer.echo(f"  {left}: {_value(found.left)}")

@@ -47,8 +47,8 @@ class Tolerance(_Strict):
         return cls(relative=RELATIVE, absolute=ABSOLUTE.get(unit, ABSOLUTE_ELSE))
 
     def around(self, value: float) -> float:
-        """Give the width around a value."""
-        return self.relative * abs(value) + self.absolute
+        """Give the width around a value; a metric that was "never" has to stay so."""
+        return self.relative * abs(value) + self.absolute if math.isfinite(value) else 0.0
 
 
 class Values(_Strict):

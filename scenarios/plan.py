@@ -84,7 +84,8 @@ def sim_setup(scenario: Scenario, site: Site, level: Level, rng: Rng) -> SimSetu
         if laser is None
         else LaserParams(reach_m=laser.reach_m, fov_rad=math.radians(laser.fov_deg), rays=laser.rays),
         actors=tuple(
-            Actor(ObstacleKind[a.kind.upper()], a.path_m, a.speed_mps, at(scenario, a.at_s), a.pauses_s) for a in scenario.actors
+            Actor(ObstacleKind[a.kind.upper()], a.path_m, a.speed_mps, at(scenario, a.at_s), a.pauses_s)
+            for a in scenario.actors
         ),
     )
 
