@@ -2,8 +2,8 @@
 
     python benchmarks/drive.py [SCENARIO] [--rounds 5]
 
-The yardstick of the same run is bare pybullet: 24 steps at 240 Hz of one free 480 kg box, without gravity or contact, for
-every 0.1 s of drive.
+The yardstick of the same run is bare pybullet: 24 steps at 240 Hz of one free 480 kg box, without gravity or contact,
+for every 0.1 s of drive.
 """
 
 import argparse
@@ -30,7 +30,7 @@ def yardstick(client: int, driven_s: float) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenario", nargs="?", default="parking-lot/square")
+    parser.add_argument("scenario", nargs="?", default="p545/field-trial")
     parser.add_argument("--rounds", type=int, default=5)
     args = parser.parse_args()
     scenario = load_scenario(args.scenario)

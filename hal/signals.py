@@ -167,6 +167,14 @@ class SystemState(IntEnum):
     ESTOP = 7
 
 
+def state_of(code: int) -> SystemState:
+    """Name a state from the bus; one that is not defined is as bad as a fault."""
+    return _STATES.get(code, SystemState.FAULT)
+
+
+_STATES = {int(state): state for state in SystemState}
+
+
 class SafetyState(Record, frozen=True):
     """What the safety node reports."""
 

@@ -60,7 +60,7 @@ class Recording:
         self.channels: dict[str, Channel] = {}
         self.metadata: dict[str, str] = {}
         self.complete = True
-        self._topics: dict[int, str] = {}
+        self.topics: dict[int, str] = {}
         self._load()
         self.tick_ns = int(self.metadata["tick_ns"])
         self.t0_ns = int(self.metadata["t0_ns"])
@@ -89,7 +89,7 @@ class Recording:
                             record.topic, schema, schemas[record.schema_id].data, record.metadata["trace"] == "1"
                         )
                         by_id[record.id] = self.channels[record.topic] = channel
-                        self._topics[record.id] = record.topic
+                        self.topics[record.id] = record.topic
                     elif isinstance(record, McapSchema):
                         schemas[record.id] = record
                     elif isinstance(record, Metadata) and record.name == "fairway":
@@ -120,12 +120,12 @@ class Recording:
         if channel is None:
             raise ObjectMissing(f"{self.path} holds no {topic}; it holds {', '.join(sorted(self.channels))}")
         schema_of(cls).check_fits(channel.schema, str(self.path))
-        parse, make = _parser(channel), _maker(channel, cls)
+        parse, make = parser_of(channel), _maker(channel, cls)
         out = []
         for raw in channel.raw:
             message = parse(raw.data)
             pairs = message.causes
-            causes = tuple((self._topics[pairs[i]], pairs[i + 1]) for i in range(0, len(pairs), 2)) if pairs else ()
+            causes = tuple((self.topics[pairs[i]], pairs[i + 1]) for i in range(0, len(pairs), 2)) if pairs else ()
             out.append(Recorded(make(message), raw.cycle, raw.write, raw.t_data_ns, causes))
         return out
 
@@ -137,9 +137,9 @@ class Recording:
         """Name causes by topic: channel ids depend on what else was recorded."""
         if _CAUSES not in data:
             return data
-        message = _parser(channel)(data)
+        message = parser_of(channel)(data)
         pairs = list(message.causes)
-        names = " ".join(f"{self._topics[pairs[i]]} {pairs[i + 1]}" for i in range(0, len(pairs), 2))
+        names = " ".join(f"{self.topics[pairs[i]]} {pairs[i + 1]}" for i in range(0, len(pairs), 2))
         message.ClearField("causes")
         return bytes(message.SerializeToString(deterministic=True)) + names.encode()
 
@@ -153,7 +153,7 @@ class Recording:
         return digest.hexdigest()
 
 
-def _parser(channel: Channel) -> Callable[[bytes], Any]:
+def parser_of(channel: Channel) -> Callable[[bytes], Any]:
     """Make the function that parses a channel's messages, once per channel."""
     if channel.parse is None:
         channel.parse = _make_parser(channel)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rtdb.errors import RecordingError
-from rtdb.recording import Recording, _parser
+from rtdb.recording import Recording, parser_of
 from rtdb.records import Field
 
 METADATA = ("scenario", "site", "seed", "level", "version", "format", "tick_ns", "t0_ns")
@@ -134,9 +134,9 @@ def _decoder(recording: Recording) -> Decode:
     def decode(topic: str, data: bytes) -> dict[str, Any]:
         channel = recording.channels[topic]
         if topic not in parsers:
-            parsers[topic] = _parser(channel)
+            parsers[topic] = parser_of(channel)
         message = parsers[topic](data)
-        pairs, topics = list(message.causes), recording._topics
+        pairs, topics = list(message.causes), recording.topics
         return {field.name: _plain(getattr(message, field.name), field) for field in channel.schema.fields} | {
             "causes": tuple(
                 f"{topics.get(pairs[k], 'unknown object')} write {pairs[k + 1]}" for k in range(0, len(pairs), 2)

@@ -138,7 +138,9 @@ class Evidence:
 @metric("")
 def waypoints_missed(e: Evidence) -> Measured | None:
     """Way-points that C did not come within the radius of, in order."""
-    return Measured(len(e.waypoints) - len(e.reached_s)) if e.truth and e.waypoints else None
+    if not e.truth or not e.waypoints:
+        return None
+    return Measured(len(e.waypoints) - len(e.reached_s), e.reached_s[-1] if e.reached_s else 0.0)
 
 
 @metric("s")
@@ -147,14 +149,15 @@ def finish_time_s(e: Evidence) -> Measured | None:
     if not e.truth or not e.waypoints:
         return None
     done = len(e.reached_s) == len(e.waypoints)
-    return Measured(e.reached_s[-1], e.reached_s[-1]) if done else Measured(math.inf)
+    last_s = e.reached_s[-1] if e.reached_s else 0.0
+    return Measured(last_s if done else math.inf, last_s)
 
 
 @metric("m/s")
 def mean_speed_mps(e: Evidence) -> Measured | None:
-    """Mean speed from the first movement to the last way-point reached."""
+    """Mean speed from the first movement to the last way-point reached; 0 if none was."""
     if not e.reached_s:
-        return None
+        return Measured(0.0) if e.truth and e.waypoints else None
     rows = [row for row in e.truth if e.moved_s <= e.time_s(row) <= e.reached_s[-1]]
     span_s = e.time_s(rows[-1]) - e.time_s(rows[0]) if len(rows) > 1 else 0.0
     return Measured((rows[-1].value.distance_m - rows[0].value.distance_m) / span_s) if span_s > 0 else None

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
 
 from autonomy.host import Host
 from autonomy.process import spawn
@@ -31,12 +31,16 @@ from hal.signals import (
     DriveCommand,
     FaultEvent,
     FollowState,
+    GuardState,
+    Hold,
+    ModuleState,
+    ModuleStatus,
     Scan,
     Scene,
     SystemState,
 )
 from hal.signals import Site as SiteRecord
-from rtdb import STATIC, Store
+from rtdb import STATIC, Object, Record, Store
 from rtdb.recorder import Recorder
 from sim.cart import GPS_LATENCY_NS, SimCart
 
@@ -139,8 +143,11 @@ class Drive:
             *([self._hand.step] if self._hand else []),
             *(host.step for host in self._hosts),
         ]
-        self._finished_s = 0.0
-        self._follow = self.cart.find("follow/state", FollowState) if self._has("follow/state", FollowState) else None
+        self._ended_s = 0.0
+        objects = {obj.name: obj.schema.name for obj in self.cart.objects()}
+        ends: list[tuple[str, type[Record]]] = [("follow/state", FollowState), ("guard/state", GuardState)]
+        self._ends = [self.cart.find(n, cls) for n, cls in ends if objects.get(n) == cls.__name__]
+        self._statuses = [self.cart.find(n, ModuleStatus) for n, record in objects.items() if record == "ModuleStatus"]
 
     def _start_modules(self, name: str | None) -> None:
         groups: list[list[Wire]] = [[], [], []]  # the first one here, each other in a process of its own
@@ -155,9 +162,6 @@ class Drive:
         self._wait_for_stack()
         for host in self._hosts:
             host.connect()
-
-    def _has(self, name: str, cls: type[FollowState]) -> bool:
-        return any(obj.name == name and obj.schema.name == cls.__name__ for obj in self.cart.objects())
 
     def _wait_for_stack(self) -> None:
         """Tick 1 waits for every component that the stack names."""
@@ -234,19 +238,33 @@ class Drive:
                 self._actors.write(self.sim.actors(), self.sim.t_ns)
 
     def _over(self, cycle: int) -> bool:
+        """Say whether the drive ends: by time, by hand, or because the cart stands and will not go on."""
         now_s = self.time_s
         if self._hand is not None and self._hand.hand.quit:
             return True
-        standing = abs(self.sim.plant.state.vx_mps) < 0.01
-        state = self._follow.visible(cycle) if self._follow is not None and cycle % 10 == 0 else None
         if cycle % 10 == 0:
-            finished = standing and (
-                (state is not None and state.value.finished) or self.hal.driver.state is SystemState.FAULT
-            )
-            self._finished_s = (self._finished_s or now_s) if finished else 0.0
-        return now_s >= self.setup.scenario.duration_s or (
-            self._finished_s > 0 and now_s - self._finished_s >= SETTLE_S
+            standing = abs(self.sim.plant.state.vx_mps) < 0.01
+            self._ended_s = (self._ended_s or now_s) if standing and self._ended(cycle) else 0.0
+        settled = self._ended_s > 0 and now_s - self._ended_s >= SETTLE_S
+        return settled or now_s >= self.setup.scenario.duration_s
+
+    def _ended(self, cycle: int) -> bool:
+        """Say whether nobody will move the cart again: it has arrived, is far astray, or something failed for good."""
+        if self.hal.driver.state is SystemState.FAULT:
+            return True
+        shown = {type(v): v for v in (self._value(obj, cycle) for obj in self._ends) if v is not None}
+        follow, guard = shown.get(FollowState), shown.get(GuardState)
+        broken = any(
+            isinstance(v := self._value(obj, cycle), ModuleStatus) and v.state is ModuleState.FAULT
+            for obj in self._statuses
         )
+        arrived = isinstance(follow, FollowState) and follow.finished
+        return arrived or broken or (isinstance(guard, GuardState) and guard.hold is Hold.OUTSIDE)
+
+    @staticmethod
+    def _value(obj: Object[Any], cycle: int) -> Any:
+        sample = obj.visible(cycle)
+        return None if sample is None else sample.value
 
     def close(self) -> None:
         """End the processes of this drive and give the stores back."""

@@ -21,7 +21,7 @@ from hal.codecs.cartcan import (
     ThrottleMode,
     ThrottleRpt,
 )
-from hal.signals import SystemState
+from hal.signals import SystemState, state_of
 
 from .watch import GOOD_BEFORE_ENABLE, CommandWatch
 
@@ -50,7 +50,7 @@ class Node:
             if received.frame_id == self.command.ID:
                 self._obey(received)
             elif isinstance(received.message, SystemRpt):
-                self.state, self._safety_ns = SystemState(received.message.state), received.t_ns
+                self.state, self._safety_ns = state_of(received.message.state), received.t_ns
             elif isinstance(received.message, Estop):
                 self.estop = bool(received.message.active)
         asked = self._asked is not None and bool(getattr(self._asked, "enable", 0))

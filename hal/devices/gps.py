@@ -13,7 +13,7 @@ import copy
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any, Final, Literal
 
@@ -84,7 +84,8 @@ class GpsReceiver:
         self._t0_ns = t0_ns
         self._bytes: deque[tuple[int, bytes]] = deque()  # when the last one leaves, those that have not left
         self._sentences: deque[tuple[int, Sentence]] = deque()  # when it is complete
-        self._refuse_if_too_long(sum(len(nmea.format(write(talker, _LONGEST))) for write in self._writers))
+        longest = _LONGEST if variation_rad is not None else replace(_LONGEST, variation_deg=None)
+        self._refuse_if_too_long(sum(len(nmea.format(write(talker, longest))) for write in self._writers))
 
     def due(self, t_ns: int) -> bool:
         """Say whether the receiver measures at `t_ns`."""

@@ -95,12 +95,12 @@ class SafetyNode:
         """Hear, decide, report. ticks: the node's own wheel count; button: the emergency stop button is pressed."""
         self._move(t_ns, ticks)
         self._hear(t_ns)
-        self.state = self._decide(t_ns, button)
+        was, self.state = self.state, self._decide(t_ns, button)
         estop = self.state is SystemState.ESTOP
         if estop != self._estop_sent or t_ns % ESTOP_NS == 0:
             self._estop_sent = estop
             self.port.send(Estop(active=estop, source=self._estop_source, latched=estop), t_ns)
-        if t_ns % REPORT_NS == 0:
+        if self.state is not was or t_ns % REPORT_NS == 0:  # a change is told at once, like an emergency stop
             self._report(t_ns)
 
     def _move(self, t_ns: int, ticks: int) -> None:

@@ -29,6 +29,7 @@ from hal.signals import (
     Odometry,
     SafetyState,
     SystemState,
+    state_of,
 )
 
 from .odometry import OdometryDriver
@@ -109,7 +110,7 @@ class CartDriver:
                 if self._steer is not None and self._brake is not None:
                     heard.actuators.append((actuator_state(self._steer, self._brake, message), t_ns))
             elif isinstance(message, SystemRpt):
-                self.state = SystemState(message.state)
+                self.state = state_of(message.state)
                 heard.safety.append((safety_state(message), t_ns))
         return heard
 
@@ -177,7 +178,7 @@ def actuator_state(steer: SteerRpt, brake: BrakeRpt, throttle: ThrottleRpt) -> A
 def safety_state(report: SystemRpt) -> SafetyState:
     """Translate SYSTEM_RPT."""
     return SafetyState(
-        state=SystemState(report.state),
+        state=state_of(report.state),
         estop=bool(report.estop),
         host_timeout=bool(report.host_timeout),
         bad_crc=bool(report.bad_crc),
