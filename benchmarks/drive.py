@@ -58,10 +58,9 @@ def main() -> None:
     print("row | wall s min/median | times real time, median/best | CPU s median | CPU over bare pybullet")
     bare = statistics.median(cpu["bare pybullet"])
     for row, walls in wall.items():
-        print(
-            f"{row} | {min(walls):.2f}/{statistics.median(walls):.2f} | {driven_s / statistics.median(walls):.0f}/"
-            f"{driven_s / min(walls):.0f} | {statistics.median(cpu[row]):.2f} | {statistics.median(cpu[row]) / bare:.2f}"
-        )
+        median_s, cpu_s = statistics.median(walls), statistics.median(cpu[row])
+        times = f"{driven_s / median_s:.0f}/{driven_s / min(walls):.0f}"
+        print(f"{row} | {min(walls):.2f}/{median_s:.2f} | {times} | {cpu_s:.2f} | {cpu_s / bare:.2f}")
 
 
 if __name__ == "__main__":

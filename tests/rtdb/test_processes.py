@@ -334,9 +334,7 @@ def test_a_store_whose_creator_was_killed_is_dead_and_its_name_is_free(peer, nam
 
 def test_a_store_lives_on_while_somebody_is_attached(peer, name):
     creator, other = peer(), peer()
-    creator(
-        f"store = Store.create({name!r})\nstore.join('w').insert('n', Count).write(Count(4))\nstore.tick()"
-    )
+    creator(f"store = Store.create({name!r})\nstore.join('w').insert('n', Count).write(Count(4))\nstore.tick()")
     other(f"store = Store.attach({name!r})")
     creator.kill()
     with pytest.raises(InUse):

@@ -37,9 +37,7 @@ class Mixed(Record):
 
 
 def mixed(k):
-    return Mixed(
-        k / 3, k % 2 == 0, Mode(k % 2), f"wörd {k}", tuple(float(i) for i in range(k % 5)), (k % 256, 0, 255)
-    )
+    return Mixed(k / 3, k % 2 == 0, Mode(k % 2), f"wörd {k}", tuple(float(i) for i in range(k % 5)), (k % 256, 0, 255))
 
 
 def drive(path, ticks=200, order: Sequence[str] = ("a", "b", "c"), noise=0, t0_ns=T0_NS):
@@ -52,9 +50,7 @@ def drive(path, ticks=200, order: Sequence[str] = ("a", "b", "c"), noise=0, t0_n
                 made["a"] = cart.join("a").insert("in", Mixed)
             if name == "b":
                 made["b"] = cart.join("b").insert("out", Count, n_causes=2)
-                made["pid"] = cart.find("b/out") and cart.join("host").insert(
-                    "pid", Count, flags=HOST_DEPENDENT
-                )
+                made["pid"] = cart.find("b/out") and cart.join("host").insert("pid", Count, flags=HOST_DEPENDENT)
             if name == "c":
                 made["c"] = world.join("c").insert("slow", Count, every=5, phase=3)
         with Recorder(path, [cart, world], {"scenario": "test"}) as recorder:
@@ -66,9 +62,7 @@ def drive(path, ticks=200, order: Sequence[str] = ("a", "b", "c"), noise=0, t0_n
                 seen = cart.snapshot().get(made["a"])
                 if seen and c % 2:
                     w = made["b"].write(Count(c), seen.t_data_ns, ((made["a"].oid, seen.write),))
-                    expected["b/out"].append(
-                        Recorded(Count(c), c, w, seen.t_data_ns, (("a/in", seen.write),))
-                    )
+                    expected["b/out"].append(Recorded(Count(c), c, w, seen.t_data_ns, (("a/in", seen.write),)))
                 made["pid"].write(Count(c * noise))
                 w = made["c"].write(Count(-c), now)
                 if c % 5 == 3:

@@ -148,9 +148,7 @@ def c_layout(tmp_path_factory):
         check=True,
     )
     layout = {}
-    for line in subprocess.run(
-        [folder / "layout"], check=True, capture_output=True, text=True
-    ).stdout.splitlines():
+    for line in subprocess.run([folder / "layout"], check=True, capture_output=True, text=True).stdout.splitlines():
         record, name, offset = line.split()
         layout.setdefault(record, {})[name] = int(offset)
     return layout
@@ -169,9 +167,7 @@ def test_a_c_compiler_and_numpy_lay_a_record_out_as_its_schema_says(c_layout, cl
 @pytest.mark.parametrize("cls", [Every, SeqBehindInt, Small, Bytes, *SIGNALS])
 def test_the_c_struct_of_a_record_compiles_with_its_own_size_check(cls, tmp_path):
     source = tmp_path / "record.c"
-    source.write_text(
-        f"#include <stdbool.h>\n#include <stdint.h>\n#include <assert.h>\n{schema_of(cls).c_struct()}\n"
-    )
+    source.write_text(f"#include <stdbool.h>\n#include <stdint.h>\n#include <assert.h>\n{schema_of(cls).c_struct()}\n")
     done = subprocess.run(
         [os.environ.get("CC", "cc"), "-std=c11", "-fsyntax-only", source],
         check=False,
@@ -390,9 +386,7 @@ def test_a_field_that_changed_its_meaning_does_not_fit(change):
 
 def test_a_field_that_came_or_went_fits():
     schema_with().check_fits(schema_with(name="R", unit="m"), "itself")
-    old = Schema.from_text(
-        json.dumps({"name": "R", "doc": "", "size": 8, "fields": [BASE | {"name": "gone"}]})
-    )
+    old = Schema.from_text(json.dumps({"name": "R", "doc": "", "size": 8, "fields": [BASE | {"name": "gone"}]}))
     schema_with().check_fits(old, "an old recording")
     old.check_fits(schema_with(), "a new recording")
 
@@ -404,9 +398,7 @@ def parsed(schema, data):
     """What Google's implementation makes of the bytes."""
     pool = descriptor_pool.DescriptorPool()
     pool.Add(schema.file_descriptor())
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"fairway.{schema.name}")).FromString(
-        data
-    )
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"fairway.{schema.name}")).FromString(data)
 
 
 @given(EVERY, st.lists(st.integers(0, 2**64 - 1), max_size=6))

@@ -113,9 +113,7 @@ def test_a_phase_beyond_the_period_is_taken_within_it(store):
 def test_cuts_are_repeatable_and_coherent_over_all_objects(store):
     a = store.join("a")
     rates = ((1, 0), (2, 1), (3, 0), (7, 4))
-    writers = [
-        a.insert(f"n{every}", Count, every=every, phase=phase, history_s=9.0) for every, phase in rates
-    ]
+    writers = [a.insert(f"n{every}", Count, every=every, phase=phase, history_s=9.0) for every, phase in rates]
     then = []
     for c in range(1, 60):
         for writer in writers:

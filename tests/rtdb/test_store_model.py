@@ -78,11 +78,7 @@ class StoreMachine(RuleBasedStateMachine):
 
     def pick(self, k):
         """One of the objects that are there now: a restore takes the youngest away."""
-        return (
-            (self.writers[k % len(self.writers)], self.models[k % len(self.writers)])
-            if self.writers
-            else None
-        )
+        return (self.writers[k % len(self.writers)], self.models[k % len(self.writers)]) if self.writers else None
 
     @rule(every=st.integers(1, 4), phase=st.integers(0, 3), slots=st.integers(4, 9))
     def insert(self, every, phase, slots):
@@ -154,9 +150,7 @@ class StoreMachine(RuleBasedStateMachine):
             rows = writer.history(t0, t0 + length * TICK_NS)
             first = max(1, len(model.writes) - model.n_slots + 2)
             expected = [
-                w
-                for w in range(first, len(model.writes) + 1)
-                if t0 <= model.writes[w - 1][1] <= t0 + length * TICK_NS
+                w for w in range(first, len(model.writes) + 1) if t0 <= model.writes[w - 1][1] <= t0 + length * TICK_NS
             ]
             assert rows["write"].tolist() == expected
             assert rows["value"]["n"].tolist() == [model.writes[w - 1][0].n for w in expected]

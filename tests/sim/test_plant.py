@@ -296,9 +296,7 @@ def test_the_brake_force_of_a_steered_front_wheel_points_along_that_wheel() -> N
 
 @pytest.mark.parametrize("friction_factor", [1.0, 0.5])
 @pytest.mark.parametrize("load_kg", [0.0, 240.0])
-def test_service_braking_of_1_5_mps2_on_the_rear_axle_does_not_lock_it(
-    friction_factor: float, load_kg: float
-) -> None:
+def test_service_braking_of_1_5_mps2_on_the_rear_axle_does_not_lock_it(friction_factor: float, load_kg: float) -> None:
     """Also on wet grass, mu 0.4. The effort is chosen so that brake and rolling resistance make 1.5 m/s2."""
     params = CartParams(load_kg=load_kg, drag_area_m2=0.0)
     rolling_mps2 = params.rolling_resistance * GRAVITY_MPS2
@@ -467,9 +465,7 @@ def test_energy_never_grows_without_drive(seed: int, dt_s: float) -> None:
     ),
     dt_s=st.sampled_from([0.005, 0.010]),
 )
-def test_no_demand_makes_the_state_infinite_or_absurd(
-    demands: list[Demand], ground: Ground, dt_s: float
-) -> None:
+def test_no_demand_makes_the_state_infinite_or_absurd(demands: list[Demand], ground: Ground, dt_s: float) -> None:
     plant = PythonPlant(dt_s=dt_s)
     for demand in demands:
         drive_for(plant, 0.5, demand, ground)
