@@ -229,7 +229,7 @@ def test_input_that_is_not_wired_is_named() -> None:
 
 def test_wired_input_that_the_module_lacks_is_named_with_those_it_has() -> None:
     inputs = {"drive_in": "follow/drive", "pose": "localise/pose", "poes": "localise/pose"}
-    with pytest.raises(ModuleError, match="guard: Guard has no input poes; it has drive_in, pose") as error:
+    with pytest.raises(ModuleError, match="guard: Guard has no input poes; it has ") as error:
         make_module(Wire("guard", "autonomy.guard:Guard", 4, 3, inputs))
     assert all(name in said(error) for name in Guard.inputs)
 

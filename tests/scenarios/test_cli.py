@@ -294,7 +294,7 @@ def test_module_that_breaks_in_a_step_is_an_error_with_its_reason(
 ) -> None:
     run = fairway("drive", short, "--level", "direct", "--use", f"follow={modules}:{cls}", "--out", tmp_path / "runs")
     assert run.returncode == 3
-    assert "ERROR after 3.0 s" in run.stdout
+    assert "ERROR after" in run.stdout
     assert f"{reason}" in run.stdout
     assert re.search(r"follow: cycle \d+: ", run.stdout)
     assert "Traceback" not in run.stdout + run.stderr

@@ -228,7 +228,7 @@ def test_drive_leaves_neither_segment_nor_process(short: Scenario) -> None:
 def test_drive_that_cannot_begin_leaves_no_segment(short: Scenario) -> None:
     name = name_of("unbegun")
     stack = load_stack(short.stack_path()).use("follow", "autonomy.guard:Guard")  # which has other inputs
-    with pytest.raises(ModuleError, match="Guard has no input site"):
+    with pytest.raises(ModuleError, match="input drive_in of Guard is not wired"):
         Drive(Setup(scenario=short, stack=stack, db=name))
     assert f"fairway-{os.getuid()}-{name}" not in segments()
 
