@@ -66,6 +66,7 @@ class Localise(Module):
     yaw_floor_rad = Param(0.005, unit="rad")
     wheel_sigma = Param(0.005, unit="1")
     drift_mps = Param(0.5, unit="m/sqrt(s)")
+    drift_radps = Param(0.3, unit="rad/sqrt(s)")
     quiet_mps2 = Param(0.25, unit="m/s2")
 
     def reset(self) -> None:
@@ -96,9 +97,10 @@ class Localise(Module):
         travel = self.samples.get("odometry")
         t_ns = travel.t_data_ns if travel is not None else self.t_ns
         left_m = right_m = 0.0
-        if self.odometry is not None and self._last is not None:
-            left_m, right_m = self.odometry.left_m - self._last.left_m, self.odometry.right_m - self._last.right_m
-        self._last = self.odometry
+        if self.odometry is not None:
+            if self._last is not None:  # counters run on through a gap, and so does what they tell
+                left_m, right_m = self.odometry.left_m - self._last.left_m, self.odometry.right_m - self._last.right_m
+            self._last = self.odometry
         dt_s = (t_ns - self._now_ns) * 1e-9
         if dt_s > 0:
             self._travel(t_ns, left_m, right_m)
@@ -136,8 +138,8 @@ class Localise(Module):
         F[COMPASS, COMPASS] = keep_compass = math.exp(-dt_s / COMPASS_TAU_S)
         slow = self._receiver[0] ** 2 * (1.0 - keep * keep) if self._quality else 0.0
         along, turn = self.slip**2 * abs(ds), self.yaw_slip**2 * abs(ds)
-        if self._last is None:  # no wheels: the cart may be anywhere that it could have walked to
-            along = self.drift_mps**2 * dt_s
+        if self.odometry is None:  # no wheels: the cart may be anywhere that it could have walked to
+            along, turn = self.drift_mps**2 * dt_s, self.drift_radps**2 * dt_s
         kf.x = self._np.array(
             [
                 x_m + ds * c,

@@ -1,8 +1,8 @@
 """The `fairway` command. Every import that costs time stands inside a command's body."""
 
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -106,19 +106,22 @@ def _drive(setup: "Setup", folder: Path, pace: float | None, console: "Console",
     from .plots import write_plots
 
     recording = folder / "run.mcap"
-    for old in (folder / "result.json", *folder.glob("*.png"), folder / "run.rrd"):
-        old.unlink(missing_ok=True)  # what was derived from an old recording must not stand beside a new one
-    with ExitStack() as shown:
+    with ExitStack() as held:
         lives: list[LiveView] = []
+        held.enter_context(_locked(folder))
 
-        def look_on(stores: "list[Store]") -> "LiveView":
+        def begin(stores: "list[Store]") -> "LiveView | None":
+            for old in (folder / "result.json", *folder.glob("*.png"), folder / "run.rrd"):
+                old.unlink(missing_ok=True)  # what was derived from an old recording must not stand beside a new one
+            if not view:
+                return None
             from .replay import LiveView
 
-            lives.append(shown.enter_context(LiveView(stores, f"{setup.scenario.id}, seed {setup.seed}")))
+            lives.append(held.enter_context(LiveView(stores, f"{setup.scenario.id}, seed {setup.seed}")))
             print(lives[0].viewer.address, flush=True)
             return lives[0]
 
-        lost = _run_drive(setup, recording, pace, console, look_on if view else None)
+        lost = _run_drive(setup, recording, pace, console, begin)
         whole = Recording(recording)
         result = judge(whole, setup.scenario.parsed_criteria, broken=lost)
         result.write(folder / "result.json")
@@ -130,12 +133,27 @@ def _drive(setup: "Setup", folder: Path, pace: float | None, console: "Console",
     return result
 
 
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep a second drive out of the folder; the kernel gives the lock back, however this process ends."""
+    import fcntl
+
+    from rtdb.errors import InUse
+
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InUse(f"another drive writes into {folder}; wait for it, or give another --out") from None
+        yield
+
+
 def _run_drive(
     setup: "Setup",
     recording: Path,
     pace: float | None,
     console: "Console",
-    view: "Callable[[list[Store]], LiveView] | None",
+    begin: "Callable[[list[Store]], LiveView | None]",
 ) -> str:
     """Drive under a progress bar; what cannot be done, and Ctrl-C, end the command."""
     from rich.progress import BarColumn, Progress, TextColumn
@@ -150,7 +168,7 @@ def _run_drive(
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(setup.scenario.id, total=setup.scenario.duration_s)
         try:
-            return drive(setup, recording, pace=pace, progress=lambda t_s: bar.update(task, completed=t_s), view=view)
+            return drive(setup, recording, pace=pace, progress=lambda t_s: bar.update(task, completed=t_s), begin=begin)
         except KeyboardInterrupt:
             bar.stop()
             kept = f"; the recording up to there is in {recording}" if recording.exists() else ""

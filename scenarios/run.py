@@ -8,9 +8,11 @@ import gc
 import logging
 import os
 import random
+import signal
+import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -103,7 +105,7 @@ class Drive:
         self._hosts: list[Host] = []
         self.sim: SimCart = None  # type: ignore[assignment]  # until assembled
         apart = setup.placement == "process" or setup.shuffle is not None
-        name = setup.db or (f"drive-{os.getpid()}" if apart else None)
+        name = setup.db if setup.db is not None else f"drive-{os.getpid()}" if apart else None
         self.cart = Store.create(name, tick_ns=TICK_NS, t0_ns=scenario.t0_ns, size=STORE_BYTES)
         self.world = Store.create(None, tick_ns=TICK_NS, t0_ns=scenario.t0_ns)
         try:
@@ -290,6 +292,26 @@ class Drive:
         self.close()
 
 
+@contextmanager
+def ctrl_c_between_cycles() -> Iterator[Callable[[], bool]]:
+    """Keep the first Ctrl-C until it is asked for; a second one does not wait."""
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False  # signals go to the main thread
+        return
+    pressed: list[int] = []
+
+    def note(number: int, _frame: object) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(number)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 class Observer(Protocol):
     """Looks on while a drive is under way: a live view."""
 
@@ -303,12 +325,13 @@ def drive(
     *,
     pace: float | None = None,
     progress: Callable[[float], None] | None = None,
-    view: Callable[[list[Store]], Observer] | None = None,
+    begin: Callable[[list[Store]], Observer | None] | None = None,
 ) -> str:
     """Drive a scenario from start to end into a recording; returns what was lost on the way, empty if nothing was.
 
     pace: times real time, None for as fast as it goes; progress: called with the time driven, twice a second of it;
-    view: makes somebody who looks on; the caller ends that.
+    begin: called once the cart stands assembled, with its stores; may give somebody who looks on. Ctrl-C raises
+    KeyboardInterrupt between two cycles, so that the recording is whole up to there.
     """
     scenario = setup.scenario
     metadata = {
@@ -318,12 +341,15 @@ def drive(
         "site": scenario.site,
         "version": version(),
     }
-    with Drive(setup) as run, Recorder(recording, [run.cart, run.world], metadata) as recorder, ExitStack() as stack:
-        observer = view([run.cart, run.world]) if view is not None else None
+    with ctrl_c_between_cycles() as pressed, Drive(setup) as run, ExitStack() as stack:
+        observer = begin([run.cart, run.world]) if begin is not None else None
+        recorder = stack.enter_context(Recorder(recording, [run.cart, run.world], metadata))
         begun_s = time.monotonic()
         gc.freeze()  # what the libraries made once is not looked through again and again
         stack.callback(gc.unfreeze)
         while not run.tick(recorder):
+            if pressed():
+                raise KeyboardInterrupt
             if observer is not None:
                 observer.record()
             if pace is not None:
