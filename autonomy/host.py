@@ -57,6 +57,7 @@ class Host:
         self._steps = self._missed = 0
         self.module.rng = seeded(seed, wire.component)
         self.module.dt_s = wire.every * store.tick_ns * 1e-9
+        self._last: dict[str, Sample[Any]] = {}
         self._started = False
         self._status.write(ModuleStatus())
 
@@ -106,12 +107,12 @@ class Host:
 
     def _read(self, cycle: int, now_ns: int) -> str:
         """Put the inputs of this cut into the module; returns what is absent, empty if nothing is."""
-        module, values = self.module, self.module.__dict__
+        module, values, last = self.module, self.module.__dict__, self._last
         module.samples.clear()
         for name, port, found, max_age_ns in self._inputs:
-            sample = found.visible(cycle) if found is not None else None
+            sample = found.visible_since(cycle, last.get(name)) if found is not None else None
             if sample is not None and now_ns - sample.t_data_ns <= max_age_ns:
-                module.samples[name] = sample
+                module.samples[name] = last[name] = sample
                 values[name] = sample.value
             elif port.optional:
                 values[name] = None

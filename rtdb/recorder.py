@@ -16,22 +16,19 @@ from .records import causes_to_proto
 from .store import HOST_DEPENDENT, Object, Store
 
 if TYPE_CHECKING:
-    from mcap.writer import Writer as McapWriter
+    from .chunks import ChunkWriter
 
 FORMAT = 1
-CHUNK_BYTES = 32 * 1024
 
 
 class Recorder:
     """Records stores that tick together. Call `record` once after each tick."""
 
     def __init__(self, path: Path, stores: list[Store], metadata: Mapping[str, str]) -> None:
-        from mcap.writer import CompressionType
-        from mcap.writer import Writer as McapWriter
+        from .chunks import ChunkWriter
 
         self._file: io.BufferedWriter = path.open("wb")
-        self._mcap: McapWriter = McapWriter(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._mcap.start(profile="", library="fairway")
+        self._mcap = ChunkWriter(self._file, library="fairway")
         self._mcap.add_metadata(
             "fairway",
             {"format": str(FORMAT), "tick_ns": str(stores[0].tick_ns), "t0_ns": str(stores[0].t0_ns), **metadata},
@@ -71,13 +68,12 @@ class Recorder:
                     data += causes_to_proto([n for oid, w in causes for n in (by_oid[oid], w)])
                 self._mcap.add_message(channel, now_ns, data, max(0, t_data_ns), write & 0xFFFFFFFF)
         if self._stores[0].cycle % self._flush_every == 0:
-            self._mcap.flush()  # type: ignore[no-untyped-call]  # ends the open chunk, which file.flush alone would not
-            self._file.flush()
+            self._mcap.flush()
 
     def close(self) -> None:
         """Finish the file with its index."""
         if not self._file.closed:
-            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._mcap.finish()
             self._file.close()
 
     def __enter__(self) -> Self:
@@ -89,7 +85,7 @@ class Recorder:
         self.close()
 
 
-def add_channel(mcap: "McapWriter", obj: Object[Any]) -> int:
+def add_channel(mcap: "ChunkWriter", obj: Object[Any]) -> int:
     """Register an object's schema and channel; returns the channel id."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 

@@ -107,6 +107,13 @@ class Object(Generic[R]):
         raw = self._store.core.visible(self.index, cycle)
         return None if raw is None else self.sample(raw)
 
+    def visible_since(self, cycle: int, last: Sample[R] | None) -> Sample[R] | None:
+        """Read as `visible` does, but give `last` back if it is still what shows, without unpacking it again."""
+        raw = self._store.core.visible(self.index, cycle)
+        if raw is None:
+            return None
+        return last if last is not None and raw[1] == last.write else self.sample(raw)
+
     def latest(self) -> Sample[R] | None:
         """Read the newest write, visible or not. For tools: two calls may differ."""
         raw = self._store.core.latest(self.index)

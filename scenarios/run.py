@@ -60,6 +60,7 @@ TICK_NS = 10_000_000
 STORE_BYTES = 8 << 20
 SETTLE_S = 1.0  # how long a finished cart stands before the drive ends
 PARTICIPANT_S = 60.0
+COLLECT_CYCLES = 3000
 Placement = Literal["inline", "process"]
 
 
@@ -345,9 +346,14 @@ def drive(
         observer = begin([run.cart, run.world]) if begin is not None else None
         recorder = stack.enter_context(Recorder(recording, [run.cart, run.world], metadata))
         begun_s = time.monotonic()
-        gc.freeze()  # what the libraries made once is not looked through again and again
+        gc.collect()
+        gc.freeze()  # what the libraries made once is not looked through again and again,
+        gc.disable()  # and what a cycle makes holds no rings; a module's own go every COLLECT_CYCLES
         stack.callback(gc.unfreeze)
+        stack.callback(gc.enable)
         while not run.tick(recorder):
+            if run.cart.cycle % COLLECT_CYCLES == 0:
+                gc.collect()
             if pressed():
                 raise KeyboardInterrupt
             if observer is not None:

@@ -217,12 +217,14 @@ class SafetyNode:
         fast = speed_mps > self.params.max_speed_mps
         self._overspeed_since_ns = (self._overspeed_since_ns or t_ns) if fast else None
         lateral_mps2 = speed_mps * speed_mps * abs(math.tan(self._steer_rad)) / self.params.wheelbase_m
-        if any(watch.silent(t_ns) for watch in self._commands.values()):
-            return FaultCode.ACTUATOR_SILENT
+        for watch in self._commands.values():
+            if watch.silent(t_ns):
+                return FaultCode.ACTUATOR_SILENT
         if self._system.silent(t_ns):
             return FaultCode.HOST_SILENT
-        if any(watch.tripped for watch in watches):
-            return FaultCode.BAD_FRAMES
+        for watch in watches:
+            if watch.tripped:
+                return FaultCode.BAD_FRAMES
         if t_ns - self._cycle_ns > CYCLE_TIMEOUT_NS:
             return FaultCode.CYCLE_STANDS
         if self._overspeed_since_ns is not None and t_ns - self._overspeed_since_ns >= OVERSPEED_NS:
