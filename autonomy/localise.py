@@ -32,6 +32,7 @@ RECEIVER = {
 }
 UNKNOWN_RECEIVER = (5.0, 300.0, 0.5)
 HISTORY_S = 0.6  # how far back a late fix may lie
+HEADING_EVERY_NS = 300_000_000
 GATE = 30.0  # squared Mahalanobis distance; a good fix exceeds it once in three million
 COMPASS_SIGMA_RAD, COMPASS_TAU_S, COMPASS_WHITE_RAD = 0.06, 15.0, 0.02  # deviation and currents, on a steel cart
 REFUSE_AT_MOST = 10  # then it is the filter that is wrong
@@ -82,7 +83,7 @@ class Localise(Module):
         )
         self._past: deque[Travelled] = deque(maxlen=max(2, int(HISTORY_S / self.dt_s)))
         self._last: Odometry | None = None
-        self._fix_write = self._heading_write = 0
+        self._fix_write = self._heading_ns = 0
         self._speed_mps = 0.0
         self._fix_ns: int | None = None
         self._refused = 0
@@ -231,9 +232,11 @@ class Localise(Module):
         self._speed_mps += 0.2 * (self.odometry.speed_mps - self._speed_mps)  # ticks are coarse: about five steps
         along_mps2 = (self._speed_mps - speed_before_mps) / dt_s
         aside_mps2 = self._speed_mps * (right_m - left_m) / self.track_m / dt_s
-        if sample is None or self.compass is None or sample.write == self._heading_write or not self.compass.valid:
+        if sample is None or self.compass is None or not self.compass.valid:
             return
-        self._heading_write = sample.write
+        if sample.t_data_ns < self._heading_ns + HEADING_EVERY_NS:
+            return  # its slow error makes ten readings a second little better than three
+        self._heading_ns = sample.t_data_ns
         if math.hypot(along_mps2, aside_mps2) > self.quiet_mps2:
             return
         np, kf = self._np, self._kf

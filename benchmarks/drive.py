@@ -45,10 +45,11 @@ def main() -> None:
         path = Path(folder) / "run.mcap"
         for _ in range(args.rounds):
             for level in ("wire", "direct"):
-                begun, begun_cpu = time.perf_counter(), time.process_time()
-                drive(Setup(scenario=scenario, level=level), path)  # type: ignore[arg-type]
-                wall[level].append(time.perf_counter() - begun)
-                cpu[level].append(time.process_time() - begun_cpu)
+                begun: list[float] = []
+                setup = Setup(scenario=scenario, level=level)  # type: ignore[arg-type]
+                drive(setup, path, begin=lambda _, at=begun: at.extend((time.perf_counter(), time.process_time())))
+                wall[level].append(time.perf_counter() - begun[0])
+                cpu[level].append(time.process_time() - begun[1])
                 recording = Recording(path)
                 driven_s = recording.time_s(recording.last_cycle)
             begun_cpu = time.process_time()

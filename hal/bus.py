@@ -1,7 +1,7 @@
 """The cart's CAN bus inside one process: ports send and receive, faults sit on the wire.
 
-Level `wire` carries true frames (8 bytes with counter and checksum) and decodes them at every receiving port, as each
-node on a real bus does. Level `direct` hands the same quantised messages over and leaves only the encoding out.
+Level `wire` carries true frames (8 bytes with counter and checksum), which faults can damage before they are decoded.
+Level `direct` hands the same quantised messages over and leaves only the encoding out.
 """
 
 from collections.abc import Callable, Iterable
@@ -44,7 +44,7 @@ class CanPort:
     def __init__(self, bus: "CanBus", name: str, accept: frozenset[int]) -> None:
         self._bus, self.name, self.accept = bus, name, accept
         self._counters: dict[int, int] = {}
-        self._queue: list[Frame | Received] = []
+        self._queue: list[Received] = []
         self.damaged = 0
 
     def send(self, message: Message, t_ns: int) -> None:
@@ -54,25 +54,30 @@ class CanPort:
         data = encode(message, counter) if self._bus.level == "wire" else message
         self._bus.carry(Frame(t_ns, self.name, message.ID, data, counter))
 
-    def hear(self, frame: "Frame | Received") -> None:
-        """Queue a frame from the bus, or at level direct what was heard."""
-        self._queue.append(frame)
+    def hear(self, received: Received) -> None:
+        """Queue what came from the bus."""
+        self._queue.append(received)
 
     def receive(self) -> list[Received]:
         """Take everything that has come since the last call, in order."""
         if not self._queue:
             return []
-        frames, self._queue = self._queue, []
-        return [frame if isinstance(frame, Received) else self._decode(frame) for frame in frames]
+        heard, self._queue = self._queue, []
+        for received in heard:
+            if received.message is None:
+                self.damaged += 1
+        return heard
 
-    def _decode(self, frame: Frame) -> Received:
-        assert isinstance(frame.data, bytes)
-        try:
-            message, counter = decode(frame.frame_id, frame.data)
-        except FrameError:
-            self.damaged += 1
-            return Received(frame.t_ns, frame.frame_id, None, -1)
-        return Received(frame.t_ns, frame.frame_id, message, counter)
+
+def read(frame: Frame) -> Received:
+    """Read a frame off the wire, as the controller of every node that hears it does: all of them see the same bytes."""
+    if isinstance(frame.data, Message):
+        return Received(frame.t_ns, frame.frame_id, frame.data, frame.counter)
+    try:
+        message, counter = decode(frame.frame_id, frame.data)
+    except FrameError:
+        return Received(frame.t_ns, frame.frame_id, None, -1)
+    return Received(frame.t_ns, frame.frame_id, message, counter)
 
 
 class CanBus:
@@ -108,10 +113,6 @@ class CanBus:
             route = self._routes[key] = tuple(
                 p for p in self._ports if frame.frame_id in p.accept and p.name != frame.sender
             )
-        heard = (
-            Received(frame.t_ns, frame.frame_id, frame.data, frame.counter)
-            if isinstance(frame.data, Message)
-            else frame
-        )
+        received = read(frame)
         for port in route:
-            port.hear(heard)
+            port.hear(received)

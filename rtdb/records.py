@@ -406,7 +406,12 @@ CAUSES_NUMBER = (
 
 def causes_to_proto(pairs: list[int]) -> bytes:
     """Encode the causes of a write, as (channel id, write number) one after the other."""
-    return _packed(_varint(CAUSES_NUMBER << 3 | 2), "Q", tuple(pairs))
+    return _causes_prefix(len(pairs)) + struct.pack(f"<{len(pairs)}Q", *pairs)
+
+
+@functools.cache
+def _causes_prefix(n: int) -> bytes:
+    return _varint(CAUSES_NUMBER << 3 | 2) + _varint(8 * n)
 
 
 def _varint(value: int) -> bytes:

@@ -346,7 +346,6 @@ def drive(
         observer = begin([run.cart, run.world]) if begin is not None else None
         recorder = stack.enter_context(Recorder(recording, [run.cart, run.world], metadata))
         begun_s = time.monotonic()
-        gc.collect()
         gc.freeze()  # what the libraries made once is not looked through again and again,
         gc.disable()  # and what a cycle makes holds no rings; a module's own go every COLLECT_CYCLES
         stack.callback(gc.unfreeze)

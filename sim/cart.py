@@ -25,6 +25,7 @@ from .terrain import Terrain
 from .world import World
 
 STEP_NS = 5_000_000
+NODE_NS = 20_000_000  # cycle of the odometry and actuator nodes; the safety node runs at every tick
 CLEARANCE_NS = 50_000_000  # distances are asked for this often, contacts at every tick once something is near
 FAR_M = 1.0  # cart and walker together do not close this in CLEARANCE_NS
 TICKS_PER_TURN = 128
@@ -127,12 +128,16 @@ class SimCart:
             self.plant.step(self._demand, ground)
         self.t_ns += tick_ns
         t_ns, s = self.t_ns, self.plant.state
-        self.odometry.poll(t_ns, s.left_travel_m, s.right_travel_m)
+        if t_ns % NODE_NS == 0:
+            self.odometry.poll(t_ns, s.left_travel_m, s.right_travel_m)
         self.safety.poll(t_ns, (self.odometry.left + self.odometry.right) // 2, self.estop_button)
-        self.steer.poll(t_ns, s.steer_rad, 0.0)
-        self.brake.poll(t_ns, s.brake, 0.0)
-        self.drive.poll(t_ns, s.vx_mps, s.drive, 0.0)
-        self._demand = Demand(self.steer.target_rad, self.brake.effort, self.drive.output, self.drive.contactor_open)
+        if t_ns % NODE_NS == 0:
+            self.steer.poll(t_ns, s.steer_rad, 0.0)
+            self.brake.poll(t_ns, s.brake, 0.0)
+            self.drive.poll(t_ns, s.vx_mps, s.drive, 0.0)
+            self._demand = Demand(
+                self.steer.target_rad, self.brake.effort, self.drive.output, self.drive.contactor_open
+            )
         if self.gps.due(t_ns):
             self._measure_gps(t_ns, s)
         if self.compass is not None and self.compass.due(t_ns):

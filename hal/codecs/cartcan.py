@@ -161,6 +161,9 @@ class Signal:
         if self.length == 1:
             return lambda value: 1 if value else 0
         if self.unit not in _SI:
+            if self.scale == 1.0:
+                lowest, highest, clamp = self.raw_minimum, self.raw_maximum, self.quantise
+                return lambda value: value if type(value) is int and lowest <= value <= highest else clamp(value)
             return self.quantise
         convert, quantise = _SI[self.unit][1], self.quantise
         return lambda value: quantise(convert(value))

@@ -69,6 +69,9 @@ class Heard:
     actuators: list[tuple[ActuatorState, int]] = field(default_factory=list)
 
 
+NOTHING = Heard()  # of a poll that brought no frame; never written to
+
+
 class CartDriver:
     """Sans-I/O host end: `poll` reads the bus, `command` writes it."""
 
@@ -89,8 +92,11 @@ class CartDriver:
 
     def poll(self) -> Heard:
         """Read what the nodes sent since the last poll."""
+        frames = self.port.receive()
+        if not frames:
+            return NOTHING
         heard = Heard()
-        for received in self.port.receive():
+        for received in frames:
             message, t_ns = received.message, received.t_ns
             if message is None:
                 continue
