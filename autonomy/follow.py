@@ -40,7 +40,7 @@ class Follow(Module):
     wheelbase_m = Param(1.66, unit="m")
     max_steer_rad = Param(0.46, unit="rad")
     turn_radius_m = Param(3.8, unit="m")
-    lookahead_s = Param(0.8, unit="s")
+    lookahead_s = Param(1.0, unit="s")
     min_lookahead_m = Param(2.2, unit="m")
     lateral_mps2 = Param(1.2, unit="m/s2")
     decel_mps2 = Param(0.7, unit="m/s2")
@@ -178,15 +178,18 @@ def widened(radii_m: list[float], least_m: float) -> list[float]:
     return out
 
 
-def stations(points: list[tuple[float, float, int]], speeds: list[float], decel_mps2: float) -> list[Station]:
-    """Put lengths and speeds together; going backward, lower each speed to what braking to the next one allows."""
+def stations(points: list[tuple[float, float, int]], speeds: list[float], accel_mps2: float) -> list[Station]:
+    """Put lengths and speeds together; lower each speed to what braking to the next, and gaining from the last, allows."""
     lengths = [0.0]
     for (ax, ay, _), (bx, by, _) in pairwise(points):
         lengths.append(lengths[-1] + math.dist((ax, ay), (bx, by)))
     planned = [*speeds[:-1], 0.3]
     for k in range(len(points) - 2, -1, -1):
         step_m = lengths[k + 1] - lengths[k]
-        planned[k] = min(planned[k], math.sqrt(planned[k + 1] ** 2 + 2.0 * decel_mps2 * step_m))
+        planned[k] = min(planned[k], math.sqrt(planned[k + 1] ** 2 + 2.0 * accel_mps2 * step_m))
+    for k in range(1, len(points)):  # from standstill it may gain as it likes: the cart itself is slow enough
+        step_m = lengths[k] - lengths[k - 1]
+        planned[k] = min(planned[k], math.sqrt(max(planned[k - 1], 1.5) ** 2 + 2.0 * accel_mps2 * step_m))
     return [Station(s, x, y, v, w) for s, (x, y, w), v in zip(lengths, points, planned, strict=True)]
 
 
