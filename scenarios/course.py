@@ -16,7 +16,7 @@ LARGEST_TURN_RAD = math.radians(135.0)
 LEG_CLEAR_M = 3.5
 CORNER_CLEAR_M = 6.5
 BOUNDARY_CLEAR_M = 7.0
-TRIES = 4000
+TRIES = 400
 Point = tuple[float, float]
 
 

@@ -1,6 +1,6 @@
 """The world in pybullet: what the cart can touch and what rays can hit. One client, owned by one World.
 
-The cart's body is driven by its pose; contacts never push it. Static obstacles form compound bodies of up to 64 boxes,
+The cart's body is driven by its pose; contacts never push it. Static obstacles form compound bodies of up to 16 boxes,
 which cost next to nothing (measured in docs/performance.md).
 """
 
@@ -20,7 +20,7 @@ BODY_REAR_M = 0.45  # the body begins this far behind C
 BODY_FLOOR_M = 0.06  # low enough to meet a kerb
 NEAR_M = 5.0
 PERSON_RADIUS_M, PERSON_HEIGHT_M = 0.30, 1.75
-COMPOUND = 64
+COMPOUND = 16  # pybullet leaves out what is beyond, without a word
 
 
 class World:
