@@ -179,7 +179,7 @@ def widened(radii_m: list[float], least_m: float) -> list[float]:
 
 
 def stations(points: list[tuple[float, float, int]], speeds: list[float], accel_mps2: float) -> list[Station]:
-    """Put lengths and speeds together; lower each speed to what braking to the next, and gaining from the last, allows."""
+    """Put lengths and speeds together; lower speeds to what braking to the next and gaining from the last allows."""
     lengths = [0.0]
     for (ax, ay, _), (bx, by, _) in pairwise(points):
         lengths.append(lengths[-1] + math.dist((ax, ay), (bx, by)))

@@ -7,8 +7,10 @@ latches). Its outputs are held for HOLD_STEPS, then the host writes their safe v
 
 import logging
 import math
+import traceback
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hal.signals import ModuleState, ModuleStatus
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 HOLD_STEPS = 2
 HISTORY_S = 2.0
+OWN_FILES = ("host.py", "module.py")  # their lines tell a student nothing
 
 
 def seeded(seed: int, name: str) -> "np.random.Generator":
@@ -97,7 +100,7 @@ class Host:
         except (Exception, SystemExit) as error:  # a module may raise anything; it must not harm others
             log.warning("%s stopped at cycle %d: %s: %s", self.wire.component, cycle, type(error).__name__, error)
             log.debug("traceback", exc_info=True)
-            self._say(ModuleState.FAULT, f"cycle {cycle}: {type(error).__name__}: {error}")
+            self._say(ModuleState.FAULT, f"cycle {cycle}: {type(error).__name__}: {error}{_where(error)}")
             self._miss(now_ns)
             return
         self._steps += 1
@@ -180,6 +183,15 @@ class Host:
             self._state, self._reason = state, reason
             cut = reason.encode()[:160].decode(errors="ignore").replace("\0", "")
             self._status.write(ModuleStatus(state=state, steps=self._steps, reason=cut))
+
+
+def _where(error: BaseException) -> str:
+    """Name file and line of the innermost frame that is not ours: where a student looks first."""
+    at = ""
+    for frame in traceback.extract_tb(error.__traceback__):
+        if Path(frame.filename).parent != Path(__file__).parent or Path(frame.filename).name not in OWN_FILES:
+            at = f" ({Path(frame.filename).name}:{frame.lineno})"
+    return at
 
 
 def finite(cls: type[Record]) -> Callable[[Any], bool]:

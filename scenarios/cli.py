@@ -95,7 +95,7 @@ def drive(
         pace = 1.0
     result = _drive(setup, folder, pace or (4.0 if view else None), console, view)
     show(console, result)
-    after_drive(console, folder, plan.id, seed)
+    after_drive(console, folder, scenario, seed)
     raise typer.Exit({"PASS": PASS, "FAIL": FAIL, "UNKNOWN": FAIL}.get(result.verdict, BROKEN))
 
 

@@ -251,8 +251,8 @@ def schema() -> None:
     typer.echo(json.dumps(scenario_schema(), indent=1))
 
 
-def after_drive(console: "Console", folder: Path, scenario_id: str, seed: int) -> None:
-    """Print where a drive's files are, and the three commands worth trying next."""
+def after_drive(console: "Console", folder: Path, scenario: str, seed: int) -> None:
+    """Print where a drive's files are, and the three commands worth trying next. `scenario`: as the user named it."""
     plots = sorted(path.name for path in folder.glob("*.png"))
     _line(console, f"recording  {folder / 'run.mcap'}")
     _line(console, f"result     {folder / 'result.json'}")
@@ -261,10 +261,10 @@ def after_drive(console: "Console", folder: Path, scenario_id: str, seed: int) -
     other = next((path.parent for path in sorted(folder.parent.glob("*/run.mcap")) if path.parent != folder), None)
     commands = [
         (f"fairway replay {folder}", "see what the cart saw, believed and did"),
-        (f"fairway drive {scenario_id} --seed {seed + 1}", "drive with other randomness"),
+        (f"fairway drive {scenario} --seed {seed + 1}", "drive with other randomness"),
         (f"fairway diff {other} {folder}", "see where this drive and another part")
         if other
-        else (f"fairway drive {scenario_id} --use follow=mine.py:Follow", "put your own module into the stack"),
+        else ("fairway check --tag smoke", "drive a set and compare with golden metrics"),
     ]
     wide = max(len(command) for command, _ in commands)
     _line(console, "try next")

@@ -343,8 +343,8 @@ def drive(
         "version": version(),
     }
     with ctrl_c_between_cycles() as pressed, Drive(setup) as run, ExitStack() as stack:
-        observer = begin([run.cart, run.world]) if begin is not None else None
         recorder = stack.enter_context(Recorder(recording, [run.cart, run.world], metadata))
+        observer = begin([run.cart, run.world]) if begin is not None else None
         begun_s = time.monotonic()
         gc.freeze()  # what the libraries made once is not looked through again and again,
         gc.disable()  # and what a cycle makes holds no rings; a module's own go every COLLECT_CYCLES
