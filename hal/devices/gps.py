@@ -9,23 +9,21 @@ The errors of the measurement are the simulator's business; the rounding of the 
 are made here. Level wire gives bytes, level direct gives the same sentences rounded alike, without the text.
 """
 
-import copy
 import math
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import date
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from hal.codecs import nmea
 from hal.codecs.nmea import Gga, Gll, Gsa, Gst, Rmc, Sentence, Vtg, Zda
 from hal.signals import FixQuality, heading_of_yaw
 
+from .talker import Talker
+
 __all__ = ["GpsReceiver"]
 
 _KNOTS_PER_MPS: Final = 3600 / 1852
-_BYTE_TIME_BAUD_NS: Final = 10 * 1_000_000_000
-"""Nanoseconds of one byte, times the baud rate: start bit, eight data bits, stop bit."""
 _COURSE_FROM_MPS: Final = 0.3
 """Below this speed the course is left empty, as u-blox receivers do."""
 _UNIX_DAY: Final = date(1970, 1, 1).toordinal()
@@ -44,14 +42,12 @@ _MODE_LETTER: Final = {
 }
 
 
-class GpsReceiver:
+class GpsReceiver(Talker):
     """Measures every `period_ns` from `t0_ns` on; the burst of a measurement ends `latency_ns` after it.
 
     In each tick: `measure` if it is `due`, then `poll`. Set `silent` for an outage: nothing is measured
     or sent then, and a burst under way is cut off for good.
     """
-
-    _STATE = ("silent", "_bytes", "_sentences")
 
     def __init__(
         self,
@@ -65,31 +61,15 @@ class GpsReceiver:
         variation_rad: float | None = None,
         t0_ns: int = 0,
     ) -> None:
-        if level not in ("wire", "direct"):
-            raise ValueError(f"level {level!r}, expected 'wire' or 'direct'")
-        if period_ns <= 0 or latency_ns < 0 or baud <= 0:
-            raise ValueError(f"period {period_ns} ns, latency {latency_ns} ns, {baud} baud: expected positive ones")
+        super().__init__(period_ns=period_ns, latency_ns=latency_ns, baud=baud, level=level, t0_ns=t0_ns)
         unknown = [name for name in sentences if name not in _WRITERS]
         if unknown or not sentences:
             raise ValueError(f"sentences {sentences}: expected some of {', '.join(_WRITERS)}")
-        self.silent = False
-        """Nothing is measured or sent while it is true."""
-        self._period_ns = period_ns
-        self._latency_ns = latency_ns
-        self._baud = baud
-        self._direct = level == "direct"
         self._writers = [_WRITERS[name] for name in sentences]
         self._talker = talker
         self._variation_deg = None if variation_rad is None else math.degrees(variation_rad)
-        self._t0_ns = t0_ns
-        self._bytes: deque[tuple[int, bytes]] = deque()  # when the last one leaves, those that have not left
-        self._sentences: deque[tuple[int, Sentence]] = deque()  # when it is complete
         longest = _LONGEST if variation_rad is not None else replace(_LONGEST, variation_deg=None)
-        self._refuse_if_too_long(sum(len(nmea.format(write(talker, longest))) for write in self._writers))
-
-    def due(self, t_ns: int) -> bool:
-        """Say whether the receiver measures at `t_ns`."""
-        return t_ns >= self._t0_ns and (t_ns - self._t0_ns) % self._period_ns == 0
+        self.refuse_if_too_long(sum(len(nmea.format(write(talker, longest))) for write in self._writers))
 
     def measure(
         self,
@@ -137,61 +117,7 @@ class GpsReceiver:
             variation_deg=self._variation_deg,
         )
         sentences = [write(self._talker, measured) for write in self._writers]
-        # Level direct needs the text too, for its length: a sentence is as late as on the wire.
-        lines = [nmea.format(sentence) for sentence in sentences]
-        self._refuse_if_too_long(sum(map(len, lines)))
-        end_ns = t_ns + self._latency_ns
-        if not self._direct:
-            self._bytes.append((end_ns, b"".join(lines)))
-            return
-        behind = sum(map(len, lines))
-        for sentence, line in zip(sentences, lines, strict=True):
-            behind -= len(line)
-            # A listener knows a line with its CR; the LF is one of the bytes behind.
-            complete_ns = end_ns - (behind + 1) * _BYTE_TIME_BAUD_NS // self._baud
-            self._sentences.append((complete_ns, nmea.quantise(sentence)))
-
-    def poll(self, t_ns: int) -> bytes | list[Sentence]:
-        """Return what left the line by `t_ns`, once: bytes or, in level direct, sentences."""
-        if self.silent:
-            self._bytes.clear()
-            self._sentences.clear()
-        if self._direct:
-            complete = []
-            while self._sentences and self._sentences[0][0] <= t_ns:
-                complete.append(self._sentences.popleft()[1])
-            return complete
-        left = b""
-        while self._bytes:
-            end_ns, data = self._bytes.popleft()
-            # Rounded up: a byte leaves as a whole.
-            keep = -((t_ns - end_ns) * self._baud // _BYTE_TIME_BAUD_NS)
-            if keep <= 0:
-                left += data
-                continue
-            at = max(len(data) - keep, 0)
-            left += data[:at]
-            self._bytes.appendleft((end_ns, data[at:]))
-            break
-        return left
-
-    def snapshot(self) -> tuple[Any, ...]:
-        """Return what `restore` needs to continue exactly from here; it can be pickled."""
-        return copy.deepcopy(tuple(getattr(self, name) for name in self._STATE))
-
-    def restore(self, snapshot: tuple[Any, ...]) -> None:
-        """Continue from `snapshot`, taken from a receiver with the same parameters."""
-        for name, value in zip(self._STATE, copy.deepcopy(snapshot), strict=True):
-            setattr(self, name, value)
-
-    def _refuse_if_too_long(self, length: int) -> None:
-        room_ns = min(self._period_ns, self._latency_ns)
-        if length * _BYTE_TIME_BAUD_NS > room_ns * self._baud:
-            raise ValueError(
-                f"{length} bytes take {length * 10_000 / self._baud:.1f} ms at {self._baud} baud, "
-                f"expected at most {room_ns / 1e6:.1f} ms in period and latency: "
-                "raise the baud rate or drop sentences"
-            )
+        self.say(t_ns, sentences)
 
 
 # ---- what the sentences say --------------------------------------------------------------------------

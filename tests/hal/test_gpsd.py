@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import select
 import shutil
 import socket
 import subprocess
@@ -42,13 +43,13 @@ def gpsd():
     )
     link = None
     try:
-        for _ in range(200):
+        for _ in range(1000):  # 20 s: a daemon says to nobody when it listens
             try:
-                link = socket.create_connection(("127.0.0.1", port), timeout=0.1)
+                link = socket.create_connection(("127.0.0.1", port), timeout=1.0)
                 break
             except OSError:
                 assert daemon.poll() is None, "gpsd ended at once"
-                os.waitid(os.P_PID, daemon.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+                select.select([], [], [], 0.02)
         assert link is not None, "gpsd does not listen"
         link.settimeout(1.0)
         link.sendall(b'?WATCH={"enable":true,"json":true};\n')

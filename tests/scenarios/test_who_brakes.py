@@ -373,4 +373,4 @@ def test_the_reason_of_a_broken_module_stands_in_the_recording(tmp_path: Path) -
     drive_into(setup, tmp_path / "run.mcap")
     rows = Recording(tmp_path / "run.mcap").find("follow/status", ModuleStatus)
     assert [row.value.state for row in rows][-2:] == [ModuleState.RUNNING, ModuleState.FAULT]
-    assert rows[-1].value.reason.endswith("ZeroDivisionError: the map is flat")
+    assert rows[-1].value.reason.endswith("ZeroDivisionError: the map is flat (broken_follow_raises.py:10)")
