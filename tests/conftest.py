@@ -4,6 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# No test is timed, and the same tree gives the same examples.
+settings.register_profile("fairway", deadline=None, derandomize=True)
+settings.load_profile("fairway")
 
 _BESIDE_CHECKOUT = Path(__file__).resolve().parents[2] / "shared" / "data"
 
