@@ -166,8 +166,9 @@ class Host:
             causes.append((found.oid, sample.write))
             t_data_ns = min(t_data_ns, sample.t_data_ns)
         lineage = tuple(causes[:8])
+        core = self._store.core
         for (_, _, writer, _), payload in zip(self._outputs, payloads, strict=True):
-            self._store.core.write(writer.index, payload, t_data_ns, lineage)
+            core.write(writer.handle, payload, core.not_before(writer.handle, t_data_ns), lineage)
 
     def _miss(self, now_ns: int) -> None:
         """Hold the outputs for a while, then write the safe ones."""

@@ -97,7 +97,6 @@ class CartHost:
         origin_cycle = (origin_ns - self._store.t0_ns) // self._store.tick_ns
         sent = self.driver.command(t_ns, sample.value if sample is not None else None, origin_ns, origin_cycle)
         if sent is not None:
-            causes = ((self._drive.oid, sample.write),) if sample is not None and self._drive is not None else ()
-            self._command.write(sent, origin_ns, causes)
+            self._command.write(sent, inputs=(sample,) if sample is not None else ())
         if t_ns % COUNTERS_NS == 0:
             self._counters.write(self.driver.counters, t_ns)

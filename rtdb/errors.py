@@ -39,6 +39,30 @@ class AgedOut(RtdbError, LookupError):
     """The value was there once; the history no longer reaches back to it."""
 
 
+class Deleted(RtdbError, LookupError):
+    """The object was deleted, and what is asked for came later or is no longer kept."""
+
+
+class Stale(RtdbError, LookupError):
+    """The value is older than its object allows, and so withheld."""
+
+
+class ReadDenied(RtdbError, PermissionError):
+    """Only the object's owner reads it."""
+
+
+class NotRepeatable(RtdbError, RuntimeError):
+    """A component of a deterministic store asked for what depends on who is faster; cuts do not."""
+
+
+class ClockDead(RtdbError, TimeoutError):
+    """Nobody ticks the store: who did is gone, and nobody took over."""
+
+
+class DataTimeBackward(RtdbError, ValueError):
+    """A write says that it was true before the one before it."""
+
+
 class NotYet(RtdbError, LookupError):
     """The cycle lies in the future, or that write has not happened."""
 
@@ -71,6 +95,18 @@ _BY_ERRNO: dict[int, tuple[type[RtdbError], str]] = {
     errno.ENOSPC: (StoreFull, "no room is left; create the store with a larger size or with more objects"),
     errno.ENAMETOOLONG: (RecordError, "a name has at most 63 bytes"),
     errno.EBADF: (NotOwner, "it is closed"),
+    errno.EIDRM: (Deleted, "it was deleted; find it again by name, or ask for a cycle before its deletion"),
+    errno.ETIME: (
+        Stale,
+        "its value is older than the object allows; see whether its writer lives: `fairway db top`",
+    ),
+    errno.EACCES: (ReadDenied, "only its owner reads it (flag READ_DENY)"),
+    errno.EOPNOTSUPP: (
+        NotRepeatable,
+        "components of a deterministic store read cuts (`snapshot`, `at_cycle`): what is newest depends on luck",
+    ),
+    errno.EHOSTDOWN: (ClockDead, "nobody ticks the store; start a clock, or take the clock of this store"),
+    errno.ERANGE: (DataTimeBackward, "its data time lies before that of the write before; data time never decreases"),
     errno.EINVAL: (RecordError, "an argument is out of range (names: printable, no blank, no '#'; at least 4 slots)"),
 }
 
@@ -79,8 +115,8 @@ def of(code: int, call: str, subject: str) -> RtdbError:
     """Make the exception for an errno of the core; `call` and `subject` say what was tried on what."""
     if code == errno.EBUSY and call == "write":
         return TooFast(
-            f"cannot write {subject}: its ring is full of what the two newest cuts still show; "
-            f"write less often, give it more slots, or see whether the clock still ticks"
+            f"cannot write {subject}: its ring is full of what the two newest cuts still show (or min_cycle_s has not "
+            f"passed); write less often, give it more slots, or see whether the clock still ticks"
         )
     if code == errno.EBUSY:
         return InUse(f"cannot {call} {subject}: a living process holds it; end that process or use another name")

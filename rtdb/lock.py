@@ -5,11 +5,14 @@ import json
 import sys
 
 from .errors import RecordError
-from .records import Record, lock_path
+from .records import Record, forget_locks, lock_path
 
 
 def extend_lock(module: str) -> list[str]:
-    """Number the fields of a module's records that have no number yet; return what was added."""
+    """Number the fields of a module's records that have no number yet; return what was added.
+
+    A record that is nested in others has its own entry, in the lock file of its own module.
+    """
     loaded = importlib.import_module(module)
     path = lock_path(module)
     if path is None:
@@ -25,6 +28,7 @@ def extend_lock(module: str) -> list[str]:
                 numbers[field] = max(numbers.values(), default=0) + 1
                 added.append(f"{name}.{field} = {numbers[field]}")
     path.write_text(json.dumps(lock, indent=1) + "\n")
+    forget_locks()
     return added
 
 

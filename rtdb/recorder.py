@@ -12,8 +12,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from .objects import HOST_DEPENDENT, Object
 from .records import causes_to_proto
-from .store import HOST_DEPENDENT, Object, Store
+from .store import Store
 
 if TYPE_CHECKING:
     from .chunks import ChunkWriter
@@ -34,23 +35,26 @@ class Recorder:
             {"format": str(FORMAT), "tick_ns": str(stores[0].tick_ns), "t0_ns": str(stores[0].t0_ns), **metadata},
         )
         self._stores = stores
-        self._channels: list[dict[int, tuple[int, Object[Any]]]] = [{} for _ in stores]  # by object index
+        self._channels: list[dict[int, tuple[int, Object[Any]]]] = [{} for _ in stores]  # by handle
         self._by_oid: list[dict[int, int]] = [{} for _ in stores]
+        self._by_name: dict[tuple[int, str, str], int] = {}  # by store, object and schema
         self._flush_every = max(1, 1_000_000_000 // stores[0].tick_ns)
         self._register()
 
     def _register(self) -> None:
         """Give channels to new objects, in the order of their names: ids do not depend on who came first."""
-        known = zip(self._stores, self._channels, self._by_oid, strict=True)
         new = [
             (obj, channels, by_oid)
-            for store, channels, by_oid in known
-            for obj in store.objects()
-            if obj.index not in channels
+            for store, channels, by_oid in zip(self._stores, self._channels, self._by_oid, strict=True)
+            for obj in store.entries()
+            if obj.handle not in channels
         ]
         for obj, channels, by_oid in sorted(new, key=lambda item: item[0].name):
-            channel = add_channel(self._mcap, obj)
-            channels[obj.index] = channel, obj
+            known = id(channels), obj.name, obj.schema.hash
+            channel = self._by_name.get(known)  # of one that was deleted
+            if channel is None:
+                channel = self._by_name[known] = add_channel(self._mcap, obj)
+            channels[obj.handle] = channel, obj
             by_oid[obj.oid] = channel
 
     def record(self) -> None:
@@ -65,7 +69,7 @@ class Recorder:
                 if causes:
                     if any(oid not in by_oid for oid, _ in causes):
                         self._register()
-                    data += causes_to_proto([n for oid, w in causes for n in (by_oid[oid], w)])
+                    data += causes_to_proto([n for oid, w in causes if oid in by_oid for n in (by_oid[oid], w)])
                 self._mcap.add_message(channel, now_ns, data, max(0, t_data_ns), write & 0xFFFFFFFF)
         if self._stores[0].cycle % self._flush_every == 0:
             self._mcap.flush()

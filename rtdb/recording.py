@@ -10,13 +10,17 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import msgspec
 
 from .errors import ObjectMissing, RecordingError
+from .json_object import JsonSchema, loads
 from .recorder import FORMAT
-from .records import Record, Schema, causes_to_proto, schema_of
+from .records import Field, Record, Schema, causes_to_proto, schema_of
+
+if TYPE_CHECKING:
+    import numpy as np
 
 R = TypeVar("R", bound=Record)
 _CAUSES = causes_to_proto([0])[:2]  # its tag
@@ -88,8 +92,10 @@ class Recording:
                         channel = Channel(
                             record.topic, schema, schemas[record.schema_id].data, record.metadata["trace"] == "1"
                         )
-                        by_id[record.id] = self.channels[record.topic] = channel
-                        self.topics[record.id] = record.topic
+                        if record.topic in self.channels:  # the same name with another schema, or of the other store
+                            channel.topic = f"{record.topic}@{record.id}"
+                        by_id[record.id] = self.channels[channel.topic] = channel
+                        self.topics[record.id] = channel.topic
                     elif isinstance(record, McapSchema):
                         schemas[record.id] = record
                     elif isinstance(record, Metadata) and record.name == "fairway":
@@ -114,20 +120,35 @@ class Recording:
         """Seconds from cycle 0 to a cycle's edge."""
         return cycle * self.tick_ns * 1e-9
 
-    def read(self, topic: str, cls: type[R]) -> list[Recorded[R]]:
-        """Read all writes of an object, by field names: what was added since takes its default."""
+    def _channel(self, topic: str) -> Channel:
         channel = self.channels.get(topic)
         if channel is None:
             raise ObjectMissing(f"{self.path} holds no {topic}; it holds {', '.join(sorted(self.channels))}")
-        schema_of(cls).check_fits(channel.schema, str(self.path))
-        parse, make = parser_of(channel), _maker(channel, cls)
-        out = []
+        return channel
+
+    def _rows(self, channel: Channel, make: Callable[[Any], Any]) -> list[Recorded[Any]]:
+        parse, out = parser_of(channel), []
         for raw in channel.raw:
             message = parse(raw.data)
             pairs = message.causes
             causes = tuple((self.topics[pairs[i]], pairs[i + 1]) for i in range(0, len(pairs), 2)) if pairs else ()
             out.append(Recorded(make(message), raw.cycle, raw.write, raw.t_data_ns, causes))
         return out
+
+    def read(self, topic: str, cls: type[R]) -> list[Recorded[R]]:
+        """Read all writes of an object, by field names: what was added since takes its default."""
+        channel = self._channel(topic)
+        if isinstance(channel.schema, JsonSchema):
+            raise RecordingError(f"{self.path}: {topic} is JSON without a record; use read_json")
+        schema_of(cls).check_fits(channel.schema, str(self.path))
+        return self._rows(channel, _maker(channel.schema, cls))
+
+    def read_json(self, topic: str) -> list[Recorded[Any]]:
+        """Read all writes of a JSON object, as dictionaries."""
+        channel = self._channel(topic)
+        if not isinstance(channel.schema, JsonSchema):
+            raise RecordingError(f"{self.path}: {topic} holds the record {channel.schema.name}, not JSON; use read")
+        return self._rows(channel, lambda message: loads(message.json))
 
     def find(self, topic: str, cls: type[R]) -> list[Recorded[R]]:
         """Read an object, or give an empty list where the recording has none."""
@@ -171,32 +192,39 @@ def _make_parser(channel: Channel) -> Callable[[bytes], Any]:
     return message_factory.GetMessageClass(message).FromString
 
 
-def _maker(channel: Channel, cls: type[R]) -> Callable[[Any], R]:
+def _maker(recorded: Schema, cls: type[R]) -> Callable[[Any], R]:
     """Build records from parsed messages by field name."""
-    recorded = {f.name for f in channel.schema.fields}
-    fields = [f for f in schema_of(cls).fields if f.name in recorded]
-    missing = [f.name for f in schema_of(cls).fields if f.name not in recorded]
-    required = {
-        info.name
-        for info in msgspec.structs.fields(cls)
-        if info.default is msgspec.NODEFAULT and info.default_factory is msgspec.NODEFAULT
-    }
-    if required & set(missing):
-        raise RecordingError(
-            f"recorded {channel.topic} has no {', '.join(sorted(required & set(missing)))}, "
-            f"and {cls.__name__} gives no default for it"
-        )
-    scope: dict[str, Any] = {"cls": cls}
+    old = {f.name: f for f in recorded.fields}
+    scope: dict[str, Any] = {"cls": cls, "pixels": _pixels}
     terms = []
-    for f in fields:
-        if f.spec.shape != "one":
-            terms.append(f"{f.name}=tuple(m.{f.name})")
-        elif f.spec.kind == "enum":
-            import typing
-
-            enum = typing.get_args(typing.get_type_hints(cls, include_extras=True)[f.name])[0]
-            scope[f"e_{f.name}"] = {e.value: e for e in enum}
-            terms.append(f"{f.name}=e_{f.name}.get(m.{f.name}, m.{f.name})")
-        else:
-            terms.append(f"{f.name}=m.{f.name}")
+    for f in schema_of(cls).fields:
+        term = f"m.{f.name}"
+        if f.name not in old:
+            continue
+        if f.spec.kind == "record":
+            scope[f"make_{f.name}"] = _maker(old[f.name].record, _class_of(f))
+            term = f"make_{f.name}({term})" if f.spec.shape == "one" else f"tuple(map(make_{f.name}, {term}))"
+        elif f.spec.kind == "image":
+            term = f"pixels({term})"
+        elif f.spec.shape != "one":
+            term = f"tuple({term})"
+        elif f.enum is not None:
+            scope[f"e_{f.name}"] = {e.value: e for e in f.enum}
+            term = f"e_{f.name}.get({term}, {term})"
+        terms.append(f"{f.name}={term}")
     return eval(f"lambda m: cls({', '.join(terms)})", scope)  # type: ignore[no-any-return]
+
+
+def _class_of(f: Field) -> type[Record]:
+    assert f.record.cls is not None  # the schema was made from a class
+    return f.record.cls
+
+
+def _pixels(message: Any) -> "np.ndarray[Any, np.dtype[np.uint8]]":
+    """View the data of a recorded image as an array (h, w, c), read-only."""
+    import numpy as np
+
+    extent = message.height, message.width, message.channels
+    if len(message.data) != extent[0] * extent[1] * extent[2]:
+        raise RecordingError(f"a recorded image of extent {extent} has {len(message.data)} bytes")
+    return np.frombuffer(message.data, np.uint8).reshape(extent)

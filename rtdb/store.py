@@ -1,4 +1,4 @@
-"""The store as Python sees it: stores, components, objects, cuts.
+"""The store as Python sees it: stores and cuts.
 
 store = Store.create()                                  # private; Store.create("cart") is shared
 localise = store.join("localise")                       # a component: the only writer of its objects
@@ -8,225 +8,23 @@ store.tick()
 store.snapshot().get(pose)                              # what everybody sees in this cycle
 """
 
-from dataclasses import dataclass
+import contextlib
+import os
+import time
+import weakref
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar, cast, overload
-
-import msgspec
+from typing import Any, Literal, Self, TypeVar, cast, overload
 
 from . import _core
-from .errors import AgedOut, ObjectMissing, RecordError
-from .records import Record, Schema, schema_of
-
-if TYPE_CHECKING:
-    import numpy as np
+from .clock import ClockInfo, Kind, RunningClock
+from .components import Component, ComponentInfo
+from .errors import Deleted, NotOwner, ObjectMissing, RecordError, StoreMissing
+from .objects import Object, Sample, Writer
+from .records import Record, Schema
+from .watch import Query, Watch, search
 
 R = TypeVar("R", bound=Record)
-Causes = tuple[tuple[int, int], ...]
-
-HOST_DEPENDENT = 1  # flag: differs from run to run (process ids, timings); not part of the trace
-MAX_SLOTS = 1 << 24  # as in fw_insert
-STATIC = 2  # flag: written once; its age says nothing
-
-
-class Sample(msgspec.Struct, Generic[R], frozen=True, gc=False):
-    """One write of an object, as read back.
-
-    `t_data_ns`: when what it tells was true; `t_commit_ns`: when it was written; `causes`: (object id, write number)
-    of what it was computed from.
-    """
-
-    value: R
-    write: int
-    t_commit_ns: int
-    t_data_ns: int
-    causes: Causes
-
-
-@dataclass(frozen=True, slots=True)
-class ComponentInfo:
-    """A component as the directory knows it. `alive`: a process holds its lock; `done`: newest cycle it finished."""
-
-    name: str
-    pid: int
-    alive: bool
-    done: int
-    participant: bool
-
-
-class Object(Generic[R]):
-    """A handle to read one object. Stays good until the store is closed."""
-
-    def __init__(self, store: "Store", index: int, cls: type[R] | None = None) -> None:
-        (
-            self.name,
-            self.oid,
-            self._component,
-            schema,
-            self.size,
-            self.n_slots,
-            self.every,
-            self.phase,
-            self.flags,
-            self.n_causes,
-            self.parent,
-            _,
-            _,
-        ) = store.core.object(index)
-        self._store, self.index = store, index
-        stored = Schema.from_text(store.core.schema(schema))
-        self.schema = schema_of(cls) if cls is not None else stored
-        if cls is not None and self.schema.hash != stored.hash:
-            self.schema.check_fits(stored, f"object {self.name}")
-            raise RecordError(
-                f"object {self.name} holds {stored.name} {stored.hash}, this program has {self.schema.name} "
-                f"{self.schema.hash}: run the same version on both sides"
-            )
-
-    @property
-    def component(self) -> str:
-        """Name of the owner."""
-        return self._store.core.component(self._component)[0]
-
-    @property
-    def refused(self) -> int:
-        """How many writes were refused as too fast."""
-        return self._store.core.object(self.index)[12]
-
-    @property
-    def head(self) -> int:
-        """Number of the newest write, 0 before the first."""
-        return self._store.core.object(self.index)[11]
-
-    def sample(self, raw: "_core.RawSample") -> Sample[R]:
-        """Give a raw sample of the core its type."""
-        return Sample(self.schema.unpack(raw[0]), *raw[1:])
-
-    def visible(self, cycle: int) -> Sample[R] | None:
-        """Read what the cut of a cycle shows; None before the first write became visible. Repeatable."""
-        raw = self._store.core.visible(self.index, cycle)
-        return None if raw is None else self.sample(raw)
-
-    def visible_since(self, cycle: int, last: Sample[R] | None) -> Sample[R] | None:
-        """Read as `visible` does, but give `last` back if it is still what shows, without unpacking it again."""
-        raw = self._store.core.visible(self.index, cycle)
-        if raw is None:
-            return None
-        return last if last is not None and raw[1] == last.write else self.sample(raw)
-
-    def latest(self) -> Sample[R] | None:
-        """Read the newest write, visible or not. For tools: two calls may differ."""
-        raw = self._store.core.latest(self.index)
-        return None if raw is None else self.sample(raw)
-
-    def read(self, write: int) -> Sample[R]:
-        """Read a write by its number; AgedOut or NotYet where it is not there."""
-        return self.sample(self._store.core.read(self.index, write))
-
-    def history(self, t0_ns: int, t1_ns: int) -> "np.ndarray[Any, Any]":
-        """Read all writes committed in [t0_ns, t1_ns] that are still there.
-
-        Returns a structured array (n,) with fields write, t_commit_ns, t_data_ns and value (the record's own dtype).
-        """
-        import numpy as np
-
-        core, oldest = self._store.core, max(1, self.head - self.n_slots + 2)
-        try:
-            first = core.as_of(self.index, t0_ns - 1) + 1
-        except AgedOut:
-            first = oldest
-        rows: list[_core.RawSample] = []
-        for write in range(max(first, oldest), self.head + 1):
-            try:
-                raw = core.read(self.index, write)
-            except AgedOut:  # overtaken by the writer while reading: start behind it
-                rows.clear()
-                continue
-            if raw[2] > t1_ns:
-                break
-            rows.append(raw)
-        out = np.empty(
-            len(rows),
-            dtype=[("write", "<u8"), ("t_commit_ns", "<i8"), ("t_data_ns", "<i8"), ("value", self.schema.dtype())],
-        )
-        for k, name in ((1, "write"), (2, "t_commit_ns"), (3, "t_data_ns")):
-            out[name] = [row[k] for row in rows]
-        out["value"] = np.frombuffer(b"".join(row[0] for row in rows), dtype=self.schema.dtype())
-        return out
-
-
-class Writer(Object[R]):
-    """A handle to read and write an object of one's own component."""
-
-    def write(self, record: R, t_data_ns: int | None = None, causes: Causes = ()) -> int:
-        """Write a value; returns its number. It shows at the object's next edge.
-
-        t_data_ns: when it was true [default: now]; raised to that of the write before if it is older.
-        """
-        core = self._store.core
-        return core.write(self.index, self.schema.pack(record), core.now_ns if t_data_ns is None else t_data_ns, causes)
-
-    def begin(self) -> memoryview:
-        """Open the next slot for writing in place; nothing shows before `commit`. The view ends with the commit."""
-        return self._store.core.begin(self.index)
-
-    def commit(self, t_data_ns: int) -> int:
-        """Publish the slot that `begin` opened."""
-        return self._store.core.commit(self.index, self.schema.size, t_data_ns)
-
-
-class Component:
-    """A component that this process is. Leaving (or dying) lets another process take its objects over."""
-
-    def __init__(self, store: "Store", index: int, name: str) -> None:
-        self._store, self.index, self.name = store, index, name
-
-    def insert(
-        self,
-        name: str,
-        cls: type[R],
-        *,
-        every: int = 1,
-        phase: int = 0,
-        history_s: float = 2.0,
-        flags: int = 0,
-        n_causes: int = 0,
-    ) -> Writer[R]:
-        """Insert the object `<component>/<name>`, or take it over from a predecessor.
-
-        every, phase: due at ticks c with c % every == phase; history_s: for how long reads reach back when the owner
-        writes once per edge.
-        """
-        full, core, schema = f"{self.name}/{name}", self._store.core, schema_of(cls)
-        if every < 1:
-            raise RecordError(f"cannot insert {full}: every={every} is not a number of ticks")
-        n_slots = int(history_s * 1e9 / (every * core.tick_ns)) + 4
-        if not 4 <= n_slots <= MAX_SLOTS:
-            raise RecordError(f"cannot insert {full}: history_s={history_s} is {n_slots} slots, at most {MAX_SLOTS}")
-        try:
-            index = core.find(full)
-        except ObjectMissing:
-            index = core.insert(
-                full,
-                self.index,
-                core.add_schema(schema.to_text()),
-                schema.size,
-                n_slots,
-                every,
-                phase % every,
-                flags,
-                n_causes,
-                0,
-            )
-        return Writer(self._store, index, cls)
-
-    def done(self, cycle: int) -> None:
-        """Say that this component has finished a cycle."""
-        self._store.core.done(self.index, cycle)
-
-    def leave(self) -> None:
-        """Stop being this component; its objects stay readable."""
-        self._store.core.leave(self.index)
+_KINDS = {"stepped": Kind.STEPPED, "barrier": Kind.BARRIER, "real": Kind.REAL}
 
 
 class Cut:
@@ -235,9 +33,18 @@ class Cut:
     def __init__(self, store: "Store", cycle: int) -> None:
         self._store, self.cycle = store, cycle
 
+    @property
+    def t_ns(self) -> int:
+        """Time of the cycle's edge."""
+        return self._store.t0_ns + self.cycle * self._store.tick_ns
+
     def get(self, obj: Object[R]) -> Sample[R] | None:
         """Read an object in this cut; None where nothing is visible yet."""
         return obj.visible(self.cycle)
+
+    def alive(self, component: str) -> bool:
+        """Whether a component lived at the tick that began this cycle."""
+        return self._store.core.alive_at(self._store.component_index(component), self.cycle)
 
     def __getitem__(self, name: str) -> Sample[Any]:
         sample = self._store.find(name).visible(self.cycle)
@@ -247,34 +54,67 @@ class Cut:
 
 
 class Store:
-    """A real-time database. Use it in a `with`, or close it."""
+    """A real-time database. Use it in a `with`, or close it. Not for several threads at a time: attach once in each."""
 
-    def __init__(self, core: _core.Store) -> None:
-        self.core = core
+    def __init__(self, core: _core.Store, name: str | None = None) -> None:
+        self.core, self.name = core, name
         self._objects: dict[tuple[str, type[Record] | None], Object[Any]] = {}
+        self._by_handle: dict[int, Object[Any]] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._version = -1
+        self._standby: RunningClock | None = None
+        _open_stores.add(self)
 
     @classmethod
     def create(
         cls,
         name: str | None = None,
         *,
+        clock: Literal["stepped", "barrier", "real"] = "stepped",
         tick_ns: int = 10_000_000,
         t0_ns: int = 0,
         size: int = 4 << 20,
         max_objects: int = 256,
+        max_components: int = 64,
+        deterministic: bool = False,
     ) -> Self:
-        """Make a store: private to this process, or under a name that others on this machine can attach to."""
-        return cls(_core.create(name, size, max_objects, tick_ns, t0_ns))
+        """Make a store: private to this process, or under a name that others on this machine can attach to.
+
+        clock: who ends the cycles, see rtdb.clock; barrier and real-time stores are shared ones, and tick once somebody
+        has called `run_clock`. tick_ns: base tick. deterministic: components read cuts only.
+        """
+        kind = _KINDS.get(clock)
+        if kind is None:
+            raise RecordError(f"clock={clock!r}: there are {', '.join(_KINDS)}")
+        if kind is not Kind.STEPPED and name is None:
+            raise RecordError(f"clock={clock!r} needs a name: a private store is ticked by its only process")
+        return cls(
+            _core.create(name, size, max_objects, max_components, int(kind), tick_ns, t0_ns, deterministic), name
+        )
 
     @classmethod
-    def attach(cls, name: str) -> Self:
-        """Attach to a named store."""
-        return cls(_core.attach(name))
+    def attach(cls, name: str, *, timeout_s: float = 0.0) -> Self:
+        """Attach to a named store, waiting for it at most timeout_s."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                return cls(_core.attach(name), name)
+            except StoreMissing:
+                if time.monotonic() >= deadline:
+                    raise
+                time.sleep(0.01)  # there is nothing to wait on yet
 
     def close(self) -> None:
         """Give the memory back; the creator also removes the name."""
-        self._objects.clear()
+        if self._standby is not None:
+            self._standby.stop()
+            self._standby = None
+        self._forget_handles()
         self.core.close()
+
+    def _forget_handles(self) -> None:
+        self._objects.clear()
+        self._by_handle.clear()
 
     def __enter__(self) -> Self:
         return self
@@ -284,23 +124,104 @@ class Store:
     ) -> None:
         self.close()
 
-    # -- components and objects -----------------------------------------------------------------------------------
+    @property
+    def memory(self) -> tuple[int, int]:
+        """Bytes of the heap, and how many of them no object has."""
+        return self.core.memory()
 
-    def join(self, name: str, *, participant: bool = False) -> Component:
-        """Become a component. A participant is waited for by `wait_done`."""
-        return Component(self, self.core.join(name, participant), name)
+    # -- components -----------------------------------------------------------------------------------------------
+
+    def join(
+        self, name: str, *, participant: bool = False, every: int = 1, phase: int = 0, version: str = ""
+    ) -> Component:
+        """Become a component, and take over what a dead predecessor left.
+
+        A participant is waited for by a barrier, and a real-time clock counts what it misses; it is due at cycles c
+        with c % every == phase.
+        """
+        if every < 1:
+            raise RecordError(f"cannot join {name}: every={every} is not a number of ticks")
+        return Component(self, self.core.join(name, participant, every, phase % every, version), name)
 
     def components(self) -> list[ComponentInfo]:
         """List the components, living and dead."""
-        raw = (self.core.component(i) for i in range(self.core.n_components()))
-        return [
-            ComponentInfo(name, pid, bool(alive), done, bool(participant))
-            for name, pid, alive, done, participant in raw
-        ]
+        return [ComponentInfo(*self.core.component(i)) for i in range(self.core.n_components())]
 
-    def objects(self) -> list[Object[Any]]:
-        """List the objects in the order of their insertion."""
-        return [Object(self, i) for i in range(self.core.n_objects())]
+    def component_index(self, name: str) -> int:
+        """Give the number of a component."""
+        for i in range(self.core.n_components()):
+            if self.core.component(i)[0] == name:
+                return i
+        raise ObjectMissing(f"no component {name!r}; there are {', '.join(c.name for c in self.components())}")
+
+    # -- objects --------------------------------------------------------------------------------------------------
+
+    def schema(self, number: int) -> Schema:
+        """Give a schema that the store holds."""
+        schema = self._schemas.get(number)
+        if schema is None:
+            schema = self._schemas[number] = Schema.from_text(self.core.schema(number))
+        return schema
+
+    def object_of(self, handle: int) -> Object[Any]:
+        """Give the object of a handle of the core."""
+        return self._by_handle.get(handle) or Object(self, handle)
+
+    def entries(self) -> list[Object[Any]]:
+        """List what the directory holds, the deleted objects too as long as their history is kept."""
+        kept: dict[int, Object[Any]] = {}
+        for handle in self.core.entries():
+            with contextlib.suppress(Deleted):  # its storage was given away while we looked
+                kept[handle] = self.object_of(handle)
+        self._by_handle = kept
+        return list(kept.values())
+
+    def objects(
+        self,
+        pattern: str | None = None,
+        *,
+        regex: str | None = None,
+        record: type[Record] | str | None = None,
+        parent: Object[Any] | None = None,
+        creator: str | None = None,
+        at_ns: int | None = None,
+    ) -> list[Object[Any]]:
+        """List objects in the order of their insertion: all, or those that fit every condition.
+
+        pattern: as in a shell; regex: somewhere in the name; record: type; creator: component; at_ns: alive then, as
+        far back as the history of deleted ones is kept.
+        """
+        return search(self, self._query(pattern, regex, record, parent, creator, at_ns))
+
+    def watch(
+        self,
+        pattern: str | None = None,
+        *,
+        regex: str | None = None,
+        record: type[Record] | str | None = None,
+        parent: Object[Any] | None = None,
+        creator: str | None = None,
+    ) -> Watch:
+        """Watch the set of objects that fit: its `changes` says what came and went."""
+        return Watch(self, self._query(pattern, regex, record, parent, creator, None))
+
+    @staticmethod
+    def _query(
+        pattern: str | None,
+        regex: str | None,
+        record: type[Record] | str | None,
+        parent: Object[Any] | None,
+        creator: str | None,
+        at_ns: int | None,
+    ) -> Query:
+        return Query(
+            pattern=pattern,
+            regex=regex,
+            record=record.__name__ if isinstance(record, type) else record,
+            parent=parent.oid if parent is not None else None,
+            creator=creator,
+            at_ns=at_ns,
+        )
 
     @overload
     def find(self, name: str, cls: type[R], *, timeout_s: float = 0.0) -> Object[R]: ...
@@ -309,19 +230,32 @@ class Store:
     def find(self, name: str, cls: type[R] | None = None, *, timeout_s: float = 0.0) -> Object[R]:
         """Find an object by name, waiting for it at most timeout_s. Without its class, values come as dictionaries."""
         key = name, cls
+        if self._version != self.core.version:  # something came or went: names may mean other objects
+            self._version = self.core.version
+            self._objects.clear()
         known = self._objects.get(key)
         if known is not None:
             return cast("Object[R]", known)
+        deadline = time.monotonic() + timeout_s
         while True:
-            n_objects = self.core.n_objects()
+            version = self.core.version
             try:
                 found: Object[R] = Object(self, self.core.find(name), cls)
                 break
-            except ObjectMissing:
-                if timeout_s <= 0 or self.core.wait_object(n_objects, int(timeout_s * 1e9)) is None:
+            except (ObjectMissing, Deleted):
+                left_ns = int((deadline - time.monotonic()) * 1e9)
+                if left_ns <= 0 or self.core.wait_directory(version, left_ns) is None:
                     raise
         self._objects[key] = found
         return found
+
+    def writer(self, name: str, cls: type[R]) -> Writer[R]:
+        """Find an object to write: one's own, or a public one."""
+        return Writer(self, self.core.find(name), cls)
+
+    def delete(self, obj: Object[Any]) -> None:
+        """Delete an object and what goes with it: for its owner; for anybody if it is public or its owner gone."""
+        self.core.delete(obj.handle)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
@@ -332,7 +266,7 @@ class Store:
 
     @property
     def now_ns(self) -> int:
-        """Edge time of the current cycle, ns since 1970."""
+        """Store time, ns since 1970: the current cycle's edge; of a real-time store, the host's steady time."""
         return self.core.now_ns
 
     @property
@@ -344,6 +278,26 @@ class Store:
     def t0_ns(self) -> int:
         """Time of cycle 0."""
         return self.core.t0_ns
+
+    @property
+    def clock(self) -> ClockInfo:
+        """The clock: its kind, whether it lives, what it left out."""
+        kind, alive, pid, cycle, skipped, takeovers, late_ns, lateness_us = self.core.clock_state()
+        return ClockInfo(Kind(kind), alive, pid, cycle, skipped, takeovers, late_ns, lateness_us, self.core.tick_ns)
+
+    def run_clock(self, wait_for: tuple[str, ...] = ()) -> RunningClock:
+        """Tick a barrier or real-time store from a thread of C; a standby if another process ticks it already.
+
+        wait_for: components without which there is no tick 1. Ends with the store.
+        """
+        if self.name is None:
+            raise NotOwner("a private store is ticked by `tick`")
+        self._standby = RunningClock(self.name, wait_for)
+        return self._standby
+
+    def take_clock(self) -> None:
+        """Take the clock of a stepped store whose holder is gone: from now on `tick` is ours to call."""
+        self.core.take_clock()
 
     def tick(self) -> int:
         """End the cycle: what was written becomes visible, for all objects that are due, at once."""
@@ -358,11 +312,11 @@ class Store:
         return Cut(self, cycle)
 
     def at(self, t_ns: int) -> Cut:
-        """Take the cut of the last tick at or before a time."""
-        return Cut(self, max(0, min((t_ns - self.core.t0_ns) // self.core.tick_ns, self.core.cycle)))
+        """Take the cut of the last tick at or before a time; reading one of the future raises NotYet."""
+        return Cut(self, max(0, (t_ns - self.core.t0_ns) // self.core.tick_ns))
 
     def wait_cycle(self, after: int, timeout_s: float) -> int | None:
-        """Wait until the cycle is larger than `after`; None after the timeout (the clock stalls or is dead)."""
+        """Wait until the cycle is larger than `after`; None after the timeout: `clock` says whether it lives."""
         return self.core.wait_cycle(after, int(timeout_s * 1e9))
 
     def wait_done(self, cycle: int, timeout_s: float) -> bool:
@@ -378,4 +332,17 @@ class Store:
     def restore(self, image: bytes) -> None:
         """Make a private store what it was when `image` was saved from it. Handles made before the save stay good."""
         self.core.restore(image)
-        self._objects.clear()
+        self._forget_handles()
+
+
+# A forked child shares the parent's locks but is another process: its copies of stores let go, and it attaches anew.
+_open_stores: "weakref.WeakSet[Store]" = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    for store in list(_open_stores):
+        with contextlib.suppress(Exception):
+            store.core.forget()
+
+
+os.register_at_fork(after_in_child=_after_fork)

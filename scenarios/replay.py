@@ -901,7 +901,7 @@ class LiveView:
         for store, names in zip(self._stores, self._names, strict=True):
             for index, (payload, _, _, t_data_ns, _) in store.core.changed():
                 if index not in names:
-                    names.update({obj.index: (obj.name, obj.schema) for obj in store.objects()})
+                    names.update({obj.handle: (obj.name, obj.schema) for obj in store.objects()})
                 self.add(*names[index], cycle, t_data_ns, payload)
         if time.monotonic() - self._flushed_s >= FLUSH_S:
             self.flush()

@@ -107,7 +107,7 @@ class Drive:
         self.sim: SimCart = None  # type: ignore[assignment]  # until assembled
         apart = setup.placement == "process" or setup.shuffle is not None
         name = setup.db if setup.db is not None else f"drive-{os.getpid()}" if apart else None
-        self.cart = Store.create(name, tick_ns=TICK_NS, t0_ns=scenario.t0_ns, size=STORE_BYTES)
+        self.cart = Store.create(name, tick_ns=TICK_NS, t0_ns=scenario.t0_ns, size=STORE_BYTES, deterministic=True)
         self.world = Store.create(None, tick_ns=TICK_NS, t0_ns=scenario.t0_ns)
         try:
             self._assemble(name)
@@ -120,7 +120,6 @@ class Drive:
     def _assemble(self, name: str | None) -> None:
         scenario, rng = self.setup.scenario, plan.rng_of(self.setup.seed)
         site = scenario.load_site()
-        self.cart.join("clock")
         try:
             course = plan.course_record(scenario, site, rng)
         except CourseImpossible as error:
@@ -170,16 +169,18 @@ class Drive:
         """Tick 1 waits for every component that the stack names."""
         wanted = {wire.component for wire in self.stack.wires}
         deadline = time.monotonic() + PARTICIPANT_S
-        while missing := wanted - {
-            obj.name.removesuffix("/status") for obj in self.cart.objects() if obj.name.endswith("/status")
-        }:
+        while True:
+            version = self.cart.core.version
+            missing = wanted - {obj.name.removesuffix("/status") for obj in self.cart.objects("*/status")}
+            if not missing:
+                return
             for child in self._children:
                 if child.poll() is not None:
                     raise DriveError(f"the process of {', '.join(sorted(missing))} ended at once", invalid=False)
             if time.monotonic() > deadline:
                 names = ", ".join(sorted(missing))
                 raise DriveError(f"{names} did not come within {PARTICIPANT_S:.0f} s", invalid=False)
-            self.cart.core.wait_object(self.cart.core.n_objects(), 100_000_000)
+            self.cart.core.wait_directory(version, 100_000_000)
 
     def _write_mission(self, site: SiteRecord, course: Course) -> None:
         mission, t0_ns = self.cart.join("mission"), self.cart.t0_ns

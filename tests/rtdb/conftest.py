@@ -1,20 +1,50 @@
 """What the tests of the store share: unique names, peers in other processes, a look at what is left in memory."""
 
 import os
+import select
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 
 import rtdb
-from rtdb import Store
+from rtdb import Record, Store
+from rtdb.records import array, i64
+
+LONG_S = 30.0  # a wait that is never waited out when all is well
 
 _numbers = count()
 _PEER = Path(__file__).parent / "helpers" / "peer.py"
+
+
+class Count(Record):
+    """A counter."""
+
+    n: Annotated[int, i64("", "number")] = 0
+
+
+class Words(Record):
+    """Many numbers, which a test writes all alike: where they differ, the value is torn."""
+
+    words: Annotated[tuple[int, ...], array("i64", 64, "", "numbers")] = (0,) * 64
+
+
+def count_to(store: Store, writer: rtdb.Writer[Count], last: int) -> None:
+    """Write c in each cycle c - 1, so that the cut of c shows c."""
+    for c in range(store.cycle + 1, last + 1):
+        writer.write(Count(c))
+        store.tick()
+
+
+def shown(cut: rtdb.Cut, obj: rtdb.Object[Count]) -> int | None:
+    """The number that a cut shows of an object, None for nothing."""
+    sample = cut.get(obj)
+    return None if sample is None else sample.value.n
 
 
 def segment_path(name: str) -> Path:
@@ -44,6 +74,10 @@ class Peer:
         """Wait for the result: the repr of a value, or "!Kind: message" of an exception."""
         return self.process.stdout.readline().rstrip("\n")
 
+    def has_answered(self) -> bool:
+        """Whether `answer` would return at once."""
+        return bool(select.select([self.process.stdout], [], [], 0)[0])
+
     def __call__(self, statement: str) -> str:
         self.send(statement)
         return self.answer()
@@ -64,6 +98,15 @@ class Peer:
     def interrupt(self) -> None:
         """Press its Ctrl-C."""
         self.process.send_signal(signal.SIGINT)
+
+    def stop(self) -> None:
+        """Stop it, clock and all, until `go`."""
+        self.process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, self.process.pid, os.WSTOPPED)
+
+    def go(self) -> None:
+        """Let it go on."""
+        self.process.send_signal(signal.SIGCONT)
 
     def close(self) -> None:
         """End it."""
@@ -100,6 +143,31 @@ def peer() -> Iterator[Callable[[], Peer]]:
     yield start
     for one in peers:
         one.close()
+
+
+@pytest.fixture
+def name(unique: Callable[[], str]) -> str:
+    """The name of a store that nobody else uses."""
+    return unique()
+
+
+@pytest.fixture
+def shared(name: str) -> Iterator[Store]:
+    """A shared stepped store with ticks of 10 ms, whose clock the test holds."""
+    with Store.create(name) as made:
+        yield made
+
+
+@pytest.fixture
+def attached(peer: Callable[[], Peer], name: str) -> Callable[[], Peer]:
+    """Starts processes that are attached, as `store`, to the store that the test made under `name`."""
+
+    def start() -> Peer:
+        one = peer()
+        assert one(f"store = Store.attach({name!r})") == "None"
+        return one
+
+    return start
 
 
 @pytest.fixture(params=["private", "shared"])

@@ -32,7 +32,7 @@ static int quit(int status, const char *what, long r) {
     return status;
 }
 
-static int insert(fw_db *db, int component, const char *name, uint32_t size, uint32_t n_slots) {
+static fw_handle insert(fw_db *db, int component, const char *name, uint32_t size, uint32_t n_slots) {
     fw_spec spec = {.size = size, .n_slots = n_slots, .every = 1, .component = (uint32_t)component};
     snprintf(spec.name, sizeof spec.name, "w/%s", name);
     return fw_insert(db, &spec);
@@ -42,26 +42,26 @@ static int insert(fw_db *db, int component, const char *name, uint32_t size, uin
 static fw_db *writer_attach(const char *name, int *component) {
     fw_db *db;
     prctl(PR_SET_PDEATHSIG, SIGKILL);
-    if (fw_attach(&db, name) < 0 || (*component = fw_join(db, "w", 0)) < 0) _exit(10);
+    if (fw_attach(&db, name) < 0 || (*component = fw_join(db, "w", NULL)) < 0) _exit(10);
     return db;
 }
 
 static void write_pairs(const char *name) {
     int component;
     fw_db *db = writer_attach(name, &component);
-    int a = insert(db, component, "a", 8, SLOTS);
+    fw_handle a = insert(db, component, "a", 8, SLOTS);
     for (unsigned i = 0; i < FILLERS; i++) {
         char filler[16];
         snprintf(filler, sizeof filler, "f%u", i);
         if (insert(db, component, filler, 8, 4) < 0) _exit(11);
     }
-    int b = insert(db, component, "b", 8, SLOTS);
+    fw_handle b = insert(db, component, "b", 8, SLOTS);
     if (a < 0 || b < 0) _exit(12);
     for (uint64_t k = 1;; k++) {
         int64_t r;
-        while ((r = fw_write(db, (uint32_t)a, &k, 8, 0, NULL, 0)) == -EBUSY) ;
+        while ((r = fw_write(db, a, &k, 8, 0, NULL, 0)) == -EBUSY) ;
         if (r < 0) _exit(13);
-        while ((r = fw_write(db, (uint32_t)b, &k, 8, 0, NULL, 0)) == -EBUSY) ;
+        while ((r = fw_write(db, b, &k, 8, 0, NULL, 0)) == -EBUSY) ;
         if (r < 0) _exit(13);
     }
 }
@@ -70,31 +70,40 @@ static void write_words(const char *name) {
     static uint64_t words[LARGE / 8];
     int component;
     fw_db *db = writer_attach(name, &component);
-    int small = insert(db, component, "small", SMALL, 4), large = insert(db, component, "large", LARGE, 4);
+    fw_handle small = insert(db, component, "small", SMALL, 4), large = insert(db, component, "large", LARGE, 4);
     if (small < 0 || large < 0) _exit(12);
     for (uint64_t k = 1;; k++) {
         for (unsigned i = 0; i < LARGE / 8; i++) words[i] = k;
-        if (fw_write(db, (uint32_t)small, words, SMALL, 0, NULL, 0) < 0) _exit(13);
-        if (fw_write(db, (uint32_t)large, words, LARGE, 0, NULL, 0) < 0) _exit(13);
+        if (fw_write(db, small, words, SMALL, 0, NULL, 0) < 0) _exit(13);
+        if (fw_write(db, large, words, LARGE, 0, NULL, 0) < 0) _exit(13);
     }
 }
 
 /* 0, with the value that cut c shows of an object; also 0 when the slots wrapped since (*seen tells) */
-static int value_at(fw_db *db, int object, uint64_t c, uint64_t *value, int *seen) {
+static int value_at(fw_db *db, fw_handle object, uint64_t c, uint64_t *value, int *seen) {
     fw_info info;
-    int64_t w = fw_visible(db, (uint32_t)object, c);
+    int64_t w = fw_visible(db, object, c);
     *value = *seen = 0;
     if (w == 0) { *seen = 1; return 0; }
     if (w == -ESTALE) return 0;
     if (w < 0) return (int)w;
-    int r = fw_read(db, (uint32_t)object, (uint64_t)w, value, 8, &info);
+    int r = fw_read(db, object, (uint64_t)w, value, 8, &info);
     *seen = r == 0;
     return r == -ESTALE ? 0 : r;
 }
 
+/* The object, once the writer has inserted it. */
+static fw_handle await(fw_db *db, const char *name) {
+    for (;;) {
+        uint64_t version = fw_directory_version(db);
+        fw_handle object = fw_find(db, name);
+        if (object >= 0 || fw_wait_directory(db, version, 10000000000) < 0) return object;
+    }
+}
+
 static int cut(fw_db *db, long ticks) {
-    if (fw_wait_object(db, FILLERS + 1, 10000000000) < 0) return quit(2, "the writer did not come up", 0);
-    int a = fw_find(db, "w/a"), b = fw_find(db, "w/b");
+    fw_handle b = await(db, "w/b"), a = fw_find(db, "w/a"); /* b is the last one */
+    if (a < 0 || b < 0) return quit(2, "the writer did not come up", 0);
     long compared = 0, advanced = 0;
     uint64_t before = 0;
     for (long i = 0; i < ticks; i++) {
@@ -125,13 +134,13 @@ static int uniform(const volatile uint64_t *words, uint32_t n) {
 
 static int torn(fw_db *db, long reads) {
     static uint64_t buffer[LARGE / 8];
-    if (fw_wait_object(db, 1, 10000000000) < 0) return quit(2, "the writer did not come up", 0);
-    int objects[2] = {fw_find(db, "w/small"), fw_find(db, "w/large")};
-    while (fw_newest(db, (uint32_t)objects[1]) <= 0)
+    fw_handle large = await(db, "w/large"), objects[2] = {fw_find(db, "w/small"), large}; /* large is the last one */
+    if (objects[0] < 0 || large < 0) return quit(2, "the writer did not come up", 0);
+    while (fw_newest(db, large) <= 0)
         if (waitpid(child, NULL, WNOHANG) != 0) return quit(2, "the writer died", 0);
     long whole = 0, refused = 0, prevented = 0, tears = 0;
     for (long i = 0; i < reads || (prevented == 0 && i < 20 * reads); i++) {
-        uint32_t object = (uint32_t)objects[i & 1];
+        fw_handle object = objects[i & 1];
         fw_info info;
         int64_t w = fw_newest(db, object);
         int r = fw_read(db, object, (uint64_t)w, buffer, sizeof buffer, &info);
@@ -158,7 +167,7 @@ int main(int argc, char **argv) {
     int cuts = strcmp(argv[1], "cut") == 0;
     long count = atol(argv[3]);
     fw_db *db;
-    fw_opts opts = {.size = 8u << 20, .max_objects = FILLERS + 2};
+    fw_opts opts = {.size = 8u << 20, .max_objects = FILLERS + 3} /* w's health too */;
     int r = fw_create(&db, argv[2], &opts);
     if (r < 0) return quit(2, "create", r);
     child = fork();

@@ -15,13 +15,16 @@ static void step(void);
 #define FW_LOAD(a, order) (step(), (a))
 #define FW_STORE(a, v, order) (step(), (void)((a) = (v)))
 #define FW_FENCE(order) step()
+#define FW_FETCH_ADD(a, v) (step(), (a) += (v), (a) - (v))
+#define FW_EXCHANGE_IF(a, seen, v) (step(), (a) == (seen) ? ((a) = (v), 1) : ((seen) = (a), 0))
+#define FW_WAKE(word) ((void)(word))
 #include "protocol.h"
 
 #define N 5u /* slots */
 
 typedef struct { fw_slot head; fw_u64 payload; } slot;
 static struct { fw_ring ring; slot slots[N]; union { fw_cuts cuts; uint64_t room[4 + 2 * N]; } u; } a, b, *const both[2] = {&a, &b}; /* cause, effect */
-static fw_clock clock_;
+static fw_edge clock_;
 static uint64_t shown[2][1000]; /* what each cut showed when it was new */
 static int countdown, extent, cut_in;
 static void (*intruder)(void);

@@ -15,7 +15,7 @@ import rtdb
 CORE = Path(rtdb.__file__).parent / "core"
 RACE = Path(__file__).with_name("cut_race.c")
 STEPS = Path(__file__).with_name("protocol_steps.c")
-UNITS = ("segment.c", "objects.c", "wait_linux.c")
+UNITS = tuple(sorted(path.name for path in CORE.glob("*.c") if path.name != "_core.c"))
 TICKS = 300_000
 MUTANT_TICKS = 3_000_000
 MUTANT_ROUNDS = 4

@@ -5,10 +5,13 @@ from typing import Annotated
 
 import numpy as np
 import pytest
-from conftest import segment_path
+from conftest import Count, count_to, segment_path, shown
 
 from rtdb import (
     AgedOut,
+    DataTimeBackward,
+    Deleted,
+    Flag,
     InUse,
     NameTaken,
     NotOwner,
@@ -20,13 +23,9 @@ from rtdb import (
     StoreFull,
     TooFast,
 )
-from rtdb.records import f8, i64, text
+from rtdb.records import f8, text
 
 TICK_S = 0.01
-
-
-class Count(Record):
-    n: Annotated[int, i64("", "number")] = 0
 
 
 class Pose(Record):
@@ -34,21 +33,27 @@ class Pose(Record):
     y_m: Annotated[float, f8("m", "north")] = 0.0
 
 
+class Other:
+    """Another program's records."""
+
+    class Pose(Record):
+        """Of the same name, in another unit."""
+
+        x_m: Annotated[float, f8("mm", "east")] = 0.0
+
+
 class Note(Record):
     words: Annotated[str, text(8, "words")] = ""
 
 
-def shown(cut, obj):
-    """The number that a cut shows of an object, None for nothing."""
-    sample = cut.get(obj)
-    return None if sample is None else sample.value.n
+def insert_raw(store, name, *, size=8, n_slots=8, every=1, phase=0, flags=0, n_causes=0):
+    """Insert an object of component 0 past the checks of Python."""
+    return store.core.insert(name, 0, 0, size, n_slots, every, phase, flags, n_causes, 0, 0, 0, 0)
 
 
-def count_to(store, writer, last):
-    """Write c in each cycle c - 1, so that the cut of c shows c."""
-    for c in range(store.cycle + 1, last + 1):
-        writer.write(Count(c))
-        store.tick()
+def names(store):
+    """The objects of a store, without those that components write about themselves."""
+    return [obj.name for obj in store.objects() if not obj.name.endswith("/health")]
 
 
 # -- edges -------------------------------------------------------------------------------------------------
@@ -280,11 +285,17 @@ def test_an_honest_writer_is_never_refused(store):
     assert [writer.refused for writer in writers] == [0, 0, 0]
 
 
-def test_data_time_never_decreases(store):
+def test_a_data_time_before_that_of_the_write_before_is_refused(store):
     writer = store.join("a").insert("n", Count)
-    for t in (50, 20, 70, 69):
+    for t in (-5, 50, 50, 70):
         writer.write(Count(t), t_data_ns=t)
-    assert [writer.read(w).t_data_ns for w in (1, 2, 3, 4)] == [50, 50, 70, 70]
+    for t in (69, 0, -(2**63)):
+        with pytest.raises(DataTimeBackward, match="a/n"):
+            writer.write(Count(t), t_data_ns=t)
+    with pytest.raises(DataTimeBackward, match="a/n"), writer.frame(t_data_ns=69):
+        pass
+    assert [writer.read(w).t_data_ns for w in (1, 2, 3, 4)] == [-5, 50, 50, 70]
+    assert (writer.head, writer.latest().value.n, writer.write(Count(70), t_data_ns=70)) == (4, 70, 5)
 
 
 def test_data_time_is_now_unless_it_is_said(store):
@@ -315,22 +326,35 @@ def test_more_causes_than_there_is_room_for_are_refused(store):
 def test_writing_in_place_shows_nothing_before_the_commit(store):
     writer = store.join("a").insert("n", Count)
     writer.write(Count(1))
-    view = writer.begin()
-    view[:] = writer.schema.pack(Count(2))
-    store.tick()
-    assert (shown(store.snapshot(), writer), writer.head) == (1, 1)
-    writer.commit(t_data_ns=9)
+    with writer.frame(t_data_ns=9) as frame:
+        frame.memory[:] = writer.schema.pack(Count(2))
+        store.tick()
+        assert (shown(store.snapshot(), writer), writer.head, frame.write) == (1, 1, 0)
     store.tick()
     assert (shown(store.snapshot(), writer), writer.latest().t_data_ns) == (2, 9)
 
 
 def test_beginning_again_abandons_what_was_begun(store):
     writer = store.join("a").insert("n", Count)
-    writer.begin()[:] = writer.schema.pack(Count(1))
-    writer.begin()[:] = writer.schema.pack(Count(2))
-    assert (writer.commit(0), writer.latest().value.n) == (1, 2)
+    writer.frame().__enter__().array["n"] = 1
+    with writer.frame() as frame:
+        frame.array["n"] = 2
+    assert (frame.write, writer.head, writer.latest().value.n) == (1, 1, 2)
     with pytest.raises(NotOwner):
-        writer.commit(0)
+        store.core.commit(writer.handle, writer.size, 0, ())
+
+
+def test_a_write_abandons_the_frame_that_was_begun(store):
+    writer = store.join("a").insert("n", Count)
+
+    def write_within():
+        with writer.frame() as frame:
+            frame.array["n"] = 1
+            writer.write(Count(2))
+
+    with pytest.raises(NotOwner, match="a/n"):
+        write_within()
+    assert (writer.head, writer.latest().value.n) == (1, 2)
 
 
 def test_a_record_of_another_type_is_refused(store):
@@ -377,9 +401,9 @@ def test_history_of_a_time_without_writes_is_empty(store):
 
 def test_as_of_gives_the_newest_write_at_or_before_a_time(store):
     writer = store.join("a").insert("n", Count, history_s=5 * TICK_S)
-    assert store.core.as_of(writer.index, 10**9) == 0
+    assert store.core.as_of(writer.handle, 10**9) == 0
     count_to(store, writer, 4)  # committed at 0, 10, 20, 30 ms
-    assert [store.core.as_of(writer.index, t) for t in (-1, 0, 9_999_999, 10_000_000, 10**12)] == [
+    assert [store.core.as_of(writer.handle, t) for t in (-1, 0, 9_999_999, 10_000_000, 10**12)] == [
         0,
         1,
         1,
@@ -388,7 +412,7 @@ def test_as_of_gives_the_newest_write_at_or_before_a_time(store):
     ]
     count_to(store, writer, 30)
     with pytest.raises(AgedOut):
-        store.core.as_of(writer.index, 0)
+        store.core.as_of(writer.handle, 0)
 
 
 # -- directory ---------------------------------------------------------------------------------------------
@@ -397,8 +421,8 @@ def test_as_of_gives_the_newest_write_at_or_before_a_time(store):
 def test_a_name_is_inserted_once(store):
     writer = store.join("a").insert("n", Count)
     with pytest.raises(NameTaken, match="a/n"):
-        store.core.insert("a/n", 0, 0, 8, 8, 1, 0, 0, 0, 0)
-    assert store.core.n_objects() == 1
+        insert_raw(store, "a/n")
+    assert names(store) == ["a/n"]
     assert store.find("a/n", Count).oid == writer.oid
 
 
@@ -435,7 +459,7 @@ def test_names_that_would_not_print_are_refused(store, name):
         store.join(name)
     store.join("a")
     with pytest.raises(RecordError):
-        store.core.insert(name, 0, 0, 8, 8, 1, 0, 0, 0, 0)
+        insert_raw(store, name)
 
 
 def test_a_component_has_no_slash_in_its_name(store):
@@ -455,13 +479,24 @@ def test_a_history_that_is_too_long_is_refused(store, history_s):
     a = store.join("a")
     with pytest.raises((RecordError, StoreFull)):
         a.insert("n", Count, history_s=history_s)
-    assert store.core.n_objects() == 0
+    assert names(store) == []
 
 
 @pytest.mark.parametrize("every", [0, -1])
 def test_a_period_that_is_not_positive_is_refused(store, every):
     with pytest.raises(RecordError):
         store.join("a").insert("n", Count, every=every)
+    with pytest.raises(RecordError):
+        store.join("b", every=every)
+    assert [c.name for c in store.components()] == ["a"]
+
+
+@pytest.mark.parametrize("wrong", [{"every": 2**32 + 1}, {"n_causes": 2**32}])
+def test_a_number_that_does_not_fit_is_refused_and_not_cut_off(store, wrong):
+    # fails: the binding parses with "I", which takes the lower 32 bits
+    a = store.join("a")
+    with pytest.raises((RecordError, OverflowError)):
+        a.insert("n", Count, **wrong)
 
 
 @pytest.mark.parametrize(
@@ -470,14 +505,14 @@ def test_a_period_that_is_not_positive_is_refused(store, every):
 def test_the_core_refuses_what_makes_no_sense(store, n_slots, every, phase, n_causes):
     store.join("a")
     with pytest.raises(RecordError, match="out of range"):
-        store.core.insert("a/n", 0, 0, 8, n_slots, every, phase, 0, n_causes, 0)
-    assert store.core.n_objects() == 0
+        insert_raw(store, "a/n", n_slots=n_slots, every=every, phase=phase, n_causes=n_causes)
+    assert names(store) == []
 
 
 def test_an_object_of_a_component_that_one_is_not_is_refused(store):
     store.join("a").leave()
     with pytest.raises(NotOwner):
-        store.core.insert("a/n", 0, 0, 8, 8, 1, 0, 0, 0, 0)
+        insert_raw(store, "a/n")
 
 
 def test_a_full_directory_takes_no_more_objects_and_harms_none():
@@ -517,8 +552,8 @@ def test_objects_that_were_refused_leave_no_trace(store):
     with pytest.raises(StoreFull):
         a.insert("huge", Count, history_s=10_000.0)
     a.insert("second", Count)
-    assert [obj.name for obj in store.objects()] == ["a/first", "a/second"]
-    assert [obj.oid for obj in store.objects()] == [1, 2]
+    first, second = store.objects("a/first") + store.objects("a/second")
+    assert (names(store), second.oid) == (["a/first", "a/second"], first.oid + 1)
 
 
 def test_find_without_a_class_gives_dictionaries_and_with_the_wrong_one_an_error(store):
@@ -526,6 +561,8 @@ def test_find_without_a_class_gives_dictionaries_and_with_the_wrong_one_an_error
     assert store.find("a/pose").latest().value == {"x_m": 1.0, "y_m": 2.0}
     with pytest.raises(RecordError, match="a/pose"):
         store.find("a/pose", Count)
+    with pytest.raises(RecordError, match=r"a/pose.*x_m"):
+        store.find("a/pose", Other.Pose)
     with pytest.raises(ObjectMissing, match="a/nothing"):
         store.find("a/nothing")
     with pytest.raises(ObjectMissing, match="a/nothing"):
@@ -548,8 +585,8 @@ def test_changed_lists_what_the_latest_tick_made_visible(store):
     seen = []
     for _ in range(4):
         store.tick()
-        seen.append([index for index, _ in store.core.changed()])
-    assert seen == [[fast.index], [], [slow.index], []]
+        seen.append([handle for handle, _ in store.core.changed() if handle in (fast.handle, slow.handle)])
+    assert seen == [[fast.handle], [], [slow.handle], []]
 
 
 def test_components_tell_who_lives(store):
@@ -559,6 +596,78 @@ def test_components_tell_who_lives(store):
     told = {c.name: (c.participant, c.done) for c in store.components()}
     assert told == {"a": (True, 7), "b": (False, 0)}
     assert store.components()[0].alive
+
+
+# -- mistakes ----------------------------------------------------------------------------------------------
+
+
+def write_late(store, writer):
+    writer.write(Count(8), t_data_ns=-1)
+
+
+def write_until_refused(store, writer):
+    for _ in range(writer.n_slots):
+        writer.write(Count(8))
+
+
+def fill_the_segment(store, writer):
+    store.join("full").insert("full", Count, history_s=1e4)
+
+
+def commit_nothing(store, writer):
+    store.core.commit(writer.handle, writer.size, 0, ())
+
+
+MISTAKES = {
+    "another record": (lambda store, w: w.write(Pose()), RecordError),
+    "a number for a record": (lambda store, w: w.write(7), RecordError),
+    "a value out of range": (lambda store, w: w.write(Count(2**63)), RecordError),
+    "a text for a number": (lambda store, w: w.write(Count("7")), RecordError),
+    "more bytes than a slot has": (lambda store, w: store.core.write(w.handle, bytes(9), 10**9, ()), RecordError),
+    "a text for a time": (lambda store, w: w.write(Count(8), t_data_ns="now"), TypeError),
+    "a time beyond 64 bits": (lambda store, w: w.write(Count(8), t_data_ns=2**63), OverflowError),
+    "data time going backward": (write_late, DataTimeBackward),
+    "too many causes": (lambda store, w: w.write(Count(8), causes=((1, 1),)), RecordError),
+    "causes without end": (lambda store, w: w.write(Count(8), causes=((1, 1),) * 9), (RecordError, ValueError)),
+    # the next two fail: SystemError, the binding expects tuples and does not look
+    "a list of causes": (lambda store, w: w.write(Count(8), causes=[(1, 1)]), (RecordError, TypeError)),
+    "half a cause": (lambda store, w: w.write(Count(8), causes=((1,),)), (RecordError, TypeError, ValueError)),
+    "a writer that is too fast": (write_until_refused, TooFast),
+    "a commit of nothing": (commit_nothing, NotOwner),
+    "a second writer": (lambda store, w: store.join("a"), InUse),
+    "a full segment": (fill_the_segment, StoreFull),
+    "an object that is not there": (lambda store, w: store.find("a/m"), ObjectMissing),
+    "a handle that names nothing": (lambda store, w: store.core.latest(99 << 32 | 9), ObjectMissing),
+    "a negative handle": (lambda store, w: store.core.latest(-1), ObjectMissing),
+    "a component that is not there": (lambda store, w: store.snapshot().alive("b"), ObjectMissing),
+    "a component that one is not": (lambda store, w: store.core.done(7, 1), NotOwner),
+    "a cycle in the future": (lambda store, w: store.at_cycle(store.cycle + 1).get(w), NotYet),
+    "a negative cycle": (lambda store, w: store.at_cycle(-1).get(w), (OverflowError, RecordError, NotYet)),
+    "another record to read": (lambda store, w: store.find("a/n", Pose), RecordError),
+    "no name": (lambda store, w: store.join(""), RecordError),
+    "a name with a NUL": (lambda store, w: store.find("a/n\0"), ValueError),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_clear_error_and_the_value_before_is_still_there(store, mistake):
+    do, error = MISTAKES[mistake]
+    writer = store.join("a").insert("n", Count, history_s=0.0)
+    writer.write(Count(5))
+    store.tick()
+    writer.write(Count(6))
+    store.tick()
+    with pytest.raises(error) as raised:
+        do(store, writer)
+    assert str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert not isinstance(raised.value, SystemError)
+    assert [shown(store.at_cycle(c), writer) for c in (1, 2)] == [5, 6]
+    store.tick()
+    store.tick()
+    writer.write(Count(7))
+    store.tick()
+    assert shown(store.snapshot(), writer) == 7
 
 
 # -- stores ------------------------------------------------------------------------------------------------
@@ -593,8 +702,9 @@ def test_a_store_name_that_is_no_file_name_is_refused(name):
 def test_a_store_without_room_for_its_own_tables_is_refused():
     with pytest.raises(RecordError):
         Store.create(size=4096)
-    with pytest.raises(RecordError):
-        Store.create(tick_ns=10)
+    for wrong in ({"tick_ns": 10}, {"size": -1}, {"max_objects": -1}, {"max_components": -1}):
+        with pytest.raises((RecordError, OverflowError)):
+            Store.create(**wrong)
 
 
 def test_a_shared_store_makes_no_image(unique):
@@ -641,7 +751,8 @@ def test_a_restored_store_runs_on_as_it_did_the_first_time():
             [w.head for w in writers],
             [[store.at_cycle(c).get(w) for w in writers] for c in range(20, 31)],
         )
-        assert store.save() == image
+        words = [np.frombuffer(saved, "<u8") for saved in (image, store.save())]
+        assert np.count_nonzero(words[0] != words[1]) == 2, "all but the counters of lives and of changes"
         assert run_on(store, writers, 40) == first
 
 
@@ -678,11 +789,63 @@ def test_what_was_begun_before_a_restore_cannot_be_committed_after_it():
     with Store.create() as store:
         writer = store.join("a").insert("n", Count)
         image = store.save()
-        writer.begin()
+        frame = writer.frame().__enter__()
         store.restore(image)
         with pytest.raises(NotOwner):
-            writer.commit(0)
+            frame.__exit__(None, None, None)
         assert writer.head == 0
+
+
+def test_a_component_that_joined_after_the_save_is_gone_after_the_restore():
+    # fails: the place of `b` counts as held by this process, so that nobody joins any more
+    with Store.create() as store:
+        a = store.join("a")
+        writer = a.insert("n", Count)
+        image = store.save()
+        b = store.join("b")
+        late = b.insert("n", Count)
+        store.restore(image)
+        assert [c.name for c in store.components()] == ["a"]
+        with pytest.raises((NotOwner, ObjectMissing, Deleted)):
+            late.write(Count(1))
+        with pytest.raises(NotOwner):
+            b.insert("m", Count)
+        other = store.join("c").insert("n", Count)
+        assert (writer.write(Count(1)), other.write(Count(2))) == (1, 1)
+        assert store.find("c/n") == other
+
+
+def test_a_handle_made_after_the_save_names_nothing_after_the_restore():
+    with Store.create() as store:
+        a = store.join("a")
+        kept = a.insert("kept", Count)
+        image = store.save()
+        late = a.insert("late", Count)
+        late.write(Count(1))
+        store.restore(image)
+        other = a.insert("other", Count)
+        other.write(Count(2))
+        store.tick()
+        for read in (late.latest, lambda: late.read(1), lambda: late.visible(1), lambda: late.write(Count(3))):
+            with pytest.raises((ObjectMissing, Deleted)):
+                read()
+        assert (shown(store.snapshot(), other), kept.write(Count(4))) == (2, 1)
+
+
+def test_an_object_deleted_after_the_save_is_there_again_after_the_restore():
+    with Store.create() as store:
+        a = store.join("a")
+        writer = a.insert("n", Count, flags=Flag.IMMEDIATE_DELETE)
+        count_to(store, writer, 3)
+        image = store.save()
+        writer.delete()
+        a.insert("other", Count).write(Count(9))
+        store.tick()
+        store.restore(image)
+        assert (names(store), store.cycle, writer.t_delete_ns) == (["a/n"], 3, None)
+        assert [shown(store.at_cycle(c), writer) for c in range(4)] == [None, 1, 2, 3]
+        count_to(store, writer, 5)
+        assert shown(store.snapshot(), writer) == 5
 
 
 def test_an_image_of_another_store_is_refused():

@@ -6,10 +6,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rtdb import Record, RecordingError, Store
+from rtdb import HOST_DEPENDENT, Record, RecordingError, Store
 from rtdb.recorder import Recorder
 from rtdb.records import array, f8, i64
-from rtdb.store import HOST_DEPENDENT
 from scenarios.cli_regression import register
 from scenarios.diff import first_difference, metadata_differences, open_recording
 

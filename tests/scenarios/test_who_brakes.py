@@ -186,7 +186,7 @@ NO_GPS = GpsOutageFault(kind="gps-outage", at_s=6.0, for_s=60.0)
 def test_the_guard_stops_a_cart_that_does_not_know_where_it_is() -> None:
     with riding(straight(NO_GPS)) as ride:
         state = ride.drive.cart.find("guard/state", GuardState)
-        while (sample := state.latest()) is not None and sample.value.hold is Hold.NONE:
+        while state.read(state.head).value.hold is Hold.NONE:
             assert not ride.over
             ride.run(ride.drive.time_s + 0.01)
         assert ride.speed_mps > 2.5
@@ -362,8 +362,8 @@ def test_a_broken_module_stops_the_cart_by_its_safe_value_and_says_why(
         ride.must_have_stopped_well()
         assert ride.states(broke_ns) == {SystemState.ENABLED}
         assert all(c.limit is Limit.NONE for c in ride.commands if c.enable)
-        sample = ride.drive.cart.find(f"{component}/status", ModuleStatus).latest()
-        assert sample is not None
+        status = ride.drive.cart.find(f"{component}/status", ModuleStatus)
+        sample = status.read(status.head)
         assert sample.value.state is ModuleState.FAULT
         assert DEEDS[deed][1] in sample.value.reason
 

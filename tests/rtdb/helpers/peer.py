@@ -7,14 +7,21 @@ import signal
 import sys
 from typing import Annotated, Any
 
-from rtdb import Record, Store
-from rtdb.records import i64
+import rtdb
+from rtdb import Record
+from rtdb.records import array, i64
 
 
 class Count(Record):
     """A counter."""
 
     n: Annotated[int, i64("", "number")] = 0
+
+
+class Words(Record):
+    """Many numbers, which a test writes all alike: where they differ, the value is torn."""
+
+    words: Annotated[tuple[int, ...], array("i64", 64, "", "numbers")] = (0,) * 64
 
 
 def run(statement: str, scope: dict[str, Any]) -> str:
@@ -33,6 +40,7 @@ def run(statement: str, scope: dict[str, Any]) -> str:
 if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # some of these processes are meant to crash
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    names: dict[str, Any] = {"Store": Store, "Count": Count, "os": os}
+    names: dict[str, Any] = {name: getattr(rtdb, name) for name in rtdb.__all__}
+    names |= {"Count": Count, "Words": Words, "os": os}
     for line in sys.stdin:
         print(run(ast.literal_eval(line), names), flush=True)
