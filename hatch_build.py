@@ -45,9 +45,10 @@ def compile_core(root: Path) -> Path:
     core, target = root / "rtdb" / "core", root / "rtdb" / "_core.abi3.so"
     partial = target.with_suffix(f".{os.getpid()}.tmp")
     subprocess.run(
-        [*compiler, "-std=c11", "-O2", "-g", "-Wall", "-Wextra", "-fPIC", "-shared", "-pthread", "-fvisibility=hidden",
+        [*compiler, "-std=c11", "-O2", "-g", "-fwrapv", "-Wall", "-Wextra", "-fPIC", "-shared", "-pthread",
+         "-fvisibility=hidden",
          f'-DFW_SOURCE_HASH="{source_hash(core)}"', f"-I{sysconfig.get_paths()['include']}",
-         *map(str, sorted(core.glob("*.c"))), str(root / "rtdb" / "_core.c"), "-o", str(partial)],
+         *map(str, sorted(core.glob("*.c"))), str(core.parent / "_core.c"), "-o", str(partial)],
         check=True,
     )  # fmt: skip
     partial.replace(target)  # a process that has the old core mapped keeps it

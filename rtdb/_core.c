@@ -91,12 +91,12 @@ static int u64_of(PyObject *o, uint64_t *out) {
     return *out == (uint64_t)-1 && PyErr_Occurred() ? -1 : 0;
 }
 
-/* (payload, write, t_commit_ns, t_data_ns, causes) of write w; NULL with an exception */
-static PyObject *sample_of(fw_db *db, fw_handle object, int64_t w) {
+/* (payload, write, t_commit_ns, t_data_ns, causes) of write w; NULL with *error, or with an exception and *error 0 */
+static PyObject *sample_or(fw_db *db, fw_handle object, int64_t w, int *error) {
     const void *data;
     fw_info info;
-    int r = fw_peek(db, object, (uint64_t)w, &data, &info);
-    if (r < 0) return fail_object(db, r, "read", object);
+    int r = *error = fw_peek(db, object, (uint64_t)w, &data, &info);
+    if (r < 0) return NULL;
     PyObject *payload = PyBytes_FromStringAndSize(NULL, (Py_ssize_t)info.size);
     if (!payload) return NULL;
     fw_copy_out(PyBytes_AsString(payload), data, info.size);
@@ -105,7 +105,8 @@ static PyObject *sample_of(fw_db *db, fw_handle object, int64_t w) {
     if (!sample) {
         Py_XDECREF(causes);
         Py_DECREF(payload);
-        return r < 0 ? fail_object(db, r, "read", object) : NULL;
+        *error = r < 0 ? r : 0;
+        return NULL;
     }
     for (uint32_t i = 0; i < info.n_causes; i++)
         PyTuple_SetItem(causes, i, Py_BuildValue("(KK)", info.causes[i].oid, info.causes[i].write));
@@ -115,6 +116,12 @@ static PyObject *sample_of(fw_db *db, fw_handle object, int64_t w) {
     PyTuple_SetItem(sample, 3, PyLong_FromLongLong(info.t_data_ns));
     PyTuple_SetItem(sample, 4, causes);
     return sample;
+}
+
+static PyObject *sample_of(fw_db *db, fw_handle object, int64_t w) {
+    int error;
+    PyObject *sample = sample_or(db, object, w, &error);
+    return sample || !error ? sample : fail_object(db, error, "read", object);
 }
 
 /* -- stores ----------------------------------------------------------------------------------------------------- */
@@ -453,10 +460,11 @@ static PyObject *store_latest(Store *self, FAST) { /* object */
     if (i64_of(args[0], &object) < 0) return NULL;
     for (int i = 0;; i++) { /* a flat-out writer may lap the reader now and then */
         int64_t w = fw_newest(self->db, object);
-        const void *data;
-        fw_info info;
-        if (w > 0 && i < 100 && fw_peek(self->db, object, (uint64_t)w, &data, &info) == -ESTALE) continue;
-        return found(self, object, w);
+        int error;
+        if (w <= 0) return found(self, object, w);
+        PyObject *sample = sample_or(self->db, object, w, &error);
+        if (sample || !error) return sample;
+        if (error != -ESTALE || i == 1000) return fail_object(self->db, error, "read", object);
     }
 }
 
@@ -483,12 +491,13 @@ static PyObject *store_next(Store *self, FAST) { /* object, after -> (sample, lo
     if (i64_of(args[0], &object) < 0 || u64_of(args[1], &after) < 0) return NULL;
     for (int i = 0;; i++) { /* a flat-out writer may take the slot between finding and reading it: then it is lost too */
         int64_t w = fw_next(self->db, object, after, &lost);
-        const void *data;
-        fw_info info;
+        int error;
         if (w == -EAGAIN) Py_RETURN_NONE;
-        if (w > 0 && i < 100 && fw_peek(self->db, object, (uint64_t)w, &data, &info) == -ESTALE) continue;
-        PyObject *sample = w < 0 ? fail_object(self->db, w, "read", object) : sample_of(self->db, object, w);
-        return sample ? Py_BuildValue("(NK)", sample, lost) : NULL;
+        if (w < 0) return fail_object(self->db, w, "read", object);
+        PyObject *sample = sample_or(self->db, object, w, &error);
+        if (sample) return Py_BuildValue("(NK)", sample, lost);
+        if (!error) return NULL;
+        if (error != -ESTALE || i == 1000) return fail_object(self->db, error, "read", object);
     }
 }
 
@@ -606,15 +615,14 @@ static PyObject *store_wait_write(Store *self, FAST) { /* object, after, t_ns of
     int64_t t, r;
     NARGS(3)
     if (i64_of(args[0], &object) < 0 || u64_of(args[1], &after) < 0 || i64_of(args[2], &t) < 0) return NULL;
-    for (;;) { /* with a look at signals ten times a second of store time, and whenever one interrupts */
-        int64_t slice = fw_now_ns(self->db) + 100000000;
-        if (slice > t) slice = t;
+    int64_t dead_since_ns = 0, limit = fw_host_limit(self->db, t);
+    do { /* in slices, so that a signal just before the system call is noticed too */
         Py_BEGIN_ALLOW_THREADS
-        r = fw_wait_write(self->db, object, after, slice);
+        r = fw_wait_write_until(self->db, object, after, t, fw_platform_monotonic_ns() + 100000000, &dead_since_ns);
         Py_END_ALLOW_THREADS
         if (PyErr_CheckSignals() < 0) return NULL;
-        if (r != -EINTR && (r != -ETIMEDOUT || slice == t || self->db->fd < 0)) break;
-    }
+        if (r == -EAGAIN && fw_platform_monotonic_ns() >= limit) r = -ETIMEDOUT;
+    } while (r == -EINTR || r == -EAGAIN);
     if (r == -ETIMEDOUT) Py_RETURN_NONE;
     return r < 0 ? fail_object(self->db, r, "wait for", object) : PyLong_FromLongLong(r);
 }

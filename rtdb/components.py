@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 R = TypeVar("R", bound=Record)
 MAX_SLOTS = 1 << 24  # as in fw_insert
+REPLACE = 1 << 31  # as FW_REPLACE in fw_layout.h: what a predecessor left goes, if the new object fits
 MIN_SLOTS = 4  # two cuts, the newest write, the one under construction
 
 
@@ -101,11 +102,12 @@ class Component:
         )
         handle = self._take_over(full, (*spec, *times))
         if handle is None:
+            spec = (*spec[:5], spec[5] | REPLACE, *spec[6:])
             handle = core.insert(full, self.index, *spec, *times)
         return Writer(self._store, handle, None if isinstance(cls, Schema) else cls)
 
     def _take_over(self, full: str, spec: tuple[int, ...]) -> int | None:
-        """Give the handle of what a predecessor left, if it is the same; delete it if it is not."""
+        """Give the handle of what a predecessor left, if it is the same."""
         core = self._store.core
         try:
             handle = core.find(full)
@@ -114,7 +116,6 @@ class Component:
             return None
         if left[2] == self.index and left[3:11] + left[15:18] == spec:
             return handle
-        core.delete(handle)
         return None
 
     def cycles(self, timeout_s: float = 1.0) -> Iterator["Cut"]:

@@ -6,6 +6,7 @@ value that is no longer there is an AgedOut error, never another value.
 """
 
 import enum
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -109,14 +110,19 @@ class Object(Generic[R]):
 
     def sample(self, raw: "_core.RawSample") -> Sample[R]:
         """Give a raw sample of the core its type."""
-        return Sample(self._unpack(raw[0]), raw[1], raw[2], raw[3], raw[4], self)
+        try:
+            return Sample(self._unpack(raw[0]), raw[1], raw[2], raw[3], raw[4], self)
+        except struct.error as error:  # written by a program that says it writes this record, and does not
+            raise RecordError(
+                f"write {raw[1]} of {self.name} has {len(raw[0])} bytes, a {self.stored.name} has {self.stored.size}"
+            ) from error
 
     # -- one write ------------------------------------------------------------------------------------------------
 
     def visible(self, cycle: int) -> Sample[R] | None:
         """Read what the cut of a cycle shows; None before the first write became visible. Repeatable."""
         raw = self._store.core.visible(self.handle, cycle)
-        return None if raw is None else Sample(self._unpack(raw[0]), raw[1], raw[2], raw[3], raw[4], self)
+        return None if raw is None else self.sample(raw)
 
     def visible_since(self, cycle: int, last: Sample[R] | None) -> Sample[R] | None:
         """Read as `visible` does, but give `last` back if it is still what shows, without unpacking it again."""
@@ -128,7 +134,7 @@ class Object(Generic[R]):
     def latest(self) -> Sample[R] | None:
         """Read the newest write, visible or not. For tools: two calls may differ."""
         raw = self._store.core.latest(self.handle)
-        return None if raw is None else Sample(self._unpack(raw[0]), raw[1], raw[2], raw[3], raw[4], self)
+        return None if raw is None else self.sample(raw)
 
     def read(self, write: int) -> Sample[R]:
         """Read a write by its number; AgedOut or NotYet where it is not there."""

@@ -219,7 +219,7 @@ def _value(f: Field, new: Field, at: int, base: int, scope: Scope) -> str:
         first = at + len(f.counts)
         many = f"v[{first}:{first}+v[{at}]]" if f.counts else f"v[{first}:{first + n}]"
     elif f.spec.kind == "str":
-        return f"v[{at}].rstrip(b'\\0').decode()"
+        return f"v[{at}].rstrip(b'\\0').decode('utf-8', 'replace')"
     elif f.spec.kind == "enum":
         known = named(scope, {e.value: e for e in new.enum} if new.enum else {value: name for name, value in f.values})
         return f"{known}.get(v[{at}], v[{at}])"

@@ -136,6 +136,7 @@ class Schema:
 
     def __init__(self, name: str, doc: str, fields: list[Field], cls: type[Record] | None = None) -> None:
         self.name, self.doc, self.cls = name, doc, cls
+        self._dtype: np.dtype[Any] | None = None
         self.fields, self.size = layout.place(name, fields)
         self.pack: Callable[[Any], bytes] = compile_pack(self)
         self.unpack: Callable[[bytes], Any] = compile_unpack(self)
@@ -219,7 +220,9 @@ class Schema:
 
         A seq also has a field `<name>_n`, an image the fields `<name>_h`, `<name>_w` and `<name>_c`.
         """
-        return layout.dtype(self)
+        if self._dtype is None:  # some 10 us
+            self._dtype = layout.dtype(self)
+        return self._dtype
 
     def c_struct(self) -> str:
         """Give the record as a C struct, behind those of the records in it."""

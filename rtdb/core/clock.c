@@ -27,11 +27,11 @@ void fw_clock_get(const fw_db *db, fw_clock_state *out) {
 
 int fw_clock_take(fw_db *db) {
     if (db->has_clock) return 0;
-    int r = -EBUSY;
-    for (int i = 0; i < 5 && (r = fw_lock(db, FW_LOCK_CLOCK, F_WRLCK)) == -EBUSY; i++) /* somebody may be marking the dead */
-        fw_platform_sleep_until(fw_platform_monotonic_ns() + 100000);
-    if (r == 0) r = fw_writable(db, db->map.clock, db->map.heap - db->map.clock, 1);
+    int r = fw_lock(db, FW_LOCK_CLOCK, F_WRLCK);
     if (r < 0) return r;
+    for (int i = 0; i < 1000 && fw_lock_held(db, FW_LOCK_MARK); i++) fw_platform_sleep_until(fw_platform_monotonic_ns() + 100000);
+    r = fw_writable(db, db->map.clock, db->map.heap - db->map.clock, 1);
+    if (r < 0) { fw_lock(db, FW_LOCK_CLOCK, F_UNLCK); return r; }
     if (fw_cycle(db)) FW_STORE(db->clock->takeovers, FW_LOAD(db->clock->takeovers, relaxed) + 1, relaxed);
     FW_STORE(db->clock->pid, (uint64_t)getpid(), relaxed);
     db->has_clock = 1;
@@ -51,21 +51,27 @@ static void clock_release(fw_db *db) {
     fw_lock(db, FW_LOCK_CLOCK, F_UNLCK);
 }
 
+/* Makes cut logs writable, down to where the lowest one is now. */
+static int map_cuts(fw_db *db, uint64_t cuts_off) {
+    if (db->fd < 0 || cuts_off >= db->cuts_mapped) return 0;
+    uint64_t low = FW_LOAD(db->dir->heap_high, acquire) / FW_PAGE * FW_PAGE;
+    if (cuts_off < low || low < db->map.heap) return -EPROTO;
+    int r = fw_writable(db, low, db->map.size - low, 1);
+    if (r == 0) db->cuts_mapped = low;
+    return r;
+}
+
 /* Brings what this process remembers of all objects up to date, and makes their cut logs writable. */
 static int refresh(fw_db *db) {
     uint64_t c = fw_cycle(db) + 1; /* what was due in a cycle that is left out is due at the next tick */
     uint64_t version = fw_directory_version(db);
     if (version == db->version) return 0;
-    uint64_t cuts_low = FW_LOAD(db->dir->heap_high, acquire) / FW_PAGE * FW_PAGE;
-    if (db->fd >= 0 && cuts_low < db->cuts_mapped && cuts_low >= db->map.heap) {
-        int r = fw_writable(db, cuts_low, db->map.size - cuts_low, 1);
-        if (r < 0) return r;
-        db->cuts_mapped = cuts_low;
-    }
-    for (uint32_t i = 0, n = fw_n_entries(db); i < n; i++) {
+    db->n_ticked = fw_n_entries(db);
+    for (uint32_t i = 0; i < db->n_ticked; i++) {
         fw_ref *ref = &db->refs[i];
         int r = fw_ref_fill(db, i);
         if (r == -EPROTO) return r;
+        if (r == 0 && (r = map_cuts(db, (uint64_t)((uint8_t *)ref->cuts - db->base))) < 0) return r;
         ref->due = UINT64_MAX;
         if (r == 0 && !FW_LOAD(db->life[i].deleted, acquire))
             ref->due = c + (ref->every + ref->phase - c % ref->every) % ref->every;
@@ -91,13 +97,17 @@ static void note_lives(fw_db *db, uint64_t c) {
 
 int fw_mark_dead(fw_db *db) {
     if (db->fd < 0) return 0;
-    int held = db->has_clock, r = held ? 0 : fw_lock(db, FW_LOCK_CLOCK, F_WRLCK);
+    int held = db->has_clock, r = held ? 0 : fw_lock(db, FW_LOCK_MARK, F_WRLCK);
     if (r < 0) return r;
+    if (!held && fw_lock_held(db, FW_LOCK_CLOCK)) { /* whoever takes the clock after this waits for us: fw_clock_take */
+        fw_lock(db, FW_LOCK_MARK, F_UNLCK);
+        return -EBUSY;
+    }
     if (!held) r = fw_writable(db, db->map.lives, db->map.heap - db->map.lives, 1);
     if (r == 0) note_lives(db, fw_cycle(db));
     if (!held) {
         fw_writable(db, db->map.lives, db->map.heap - db->map.lives, 0);
-        fw_lock(db, FW_LOCK_CLOCK, F_UNLCK);
+        fw_lock(db, FW_LOCK_MARK, F_UNLCK);
     }
     return r;
 }
@@ -106,6 +116,8 @@ int fw_mark_dead(fw_db *db) {
 static void note_missed(fw_db *db, uint64_t cycle) {
     for (uint32_t i = 0, n = fw_n_components(db); i < n; i++) {
         const fw_centry *e = &db->components[i];
+        fw_cuts *log = fw_life_log(db, i);
+        if (FW_LOAD(log->now, relaxed) != 2) continue; /* the dead owe nothing */
         if (e->participant && cycle % (e->every ? e->every : 1) == e->phase && FW_LOAD(db->done[i], relaxed) < cycle)
             FW_STORE(db->missed[i], FW_LOAD(db->missed[i], relaxed) + 1, relaxed);
     }
@@ -117,7 +129,7 @@ static int tick_to(fw_db *db, uint64_t c) {
     fw_tick_begin(&db->clock->edge, c);
     int r = refresh(db); /* behind the fence of the epoch: with delete_one */
     if (r < 0) return r;
-    for (uint32_t i = 0, n = fw_n_entries(db); i < n; i++) {
+    for (uint32_t i = 0; i < db->n_ticked; i++) { /* not those that were inserted since: the next tick knows them */
         fw_ref *ref = &db->refs[i];
         if (ref->due > c) continue;
         fw_tick_object(ref->ring, ref->cuts, ref->n_slots, c);
@@ -144,6 +156,8 @@ int64_t fw_tick(fw_db *db) {
 
 /* -- a clock that runs by itself ------------------------------------------------------------------------------------- */
 
+static int is_stopped(const volatile int *stop) { return __atomic_load_n(stop, __ATOMIC_RELAXED); }
+
 static int all_here(fw_db *db, const char *const *wait_for, uint32_t n) {
     for (uint32_t k = 0; k < n; k++) {
         int here = 0;
@@ -161,7 +175,7 @@ static int participants_live(const fw_db *db) {
 }
 
 static int run_barrier(fw_db *db, const volatile int *stop) {
-    while (!*stop) {
+    while (!is_stopped(stop)) {
         int r = participants_live(db) ? fw_wait_done(db, fw_cycle(db), 100000000)
                                       : fw_wait_directory(db, fw_directory_version(db), 10000000); /* nobody to wait for */
         if (r == 0 && !participants_live(db)) continue;
@@ -174,7 +188,7 @@ static int run_barrier(fw_db *db, const volatile int *stop) {
 
 static int run_real(fw_db *db, const volatile int *stop) {
     int64_t tick_ns = db->header->tick_ns, offset_ns = db->header->offset_ns;
-    while (!*stop) {
+    while (!is_stopped(stop)) {
         uint64_t next = fw_cycle(db) + 1;
         int64_t deadline = edge_ns(db, next) - offset_ns, now = fw_platform_monotonic_ns();
         if (now < deadline - 100000000) { fw_platform_sleep_until(now + 100000000); continue; } /* stop is looked at */
@@ -197,9 +211,9 @@ int fw_clock_run(fw_db *db, const char *const *wait_for, uint32_t n, const volat
     if (db->fd < 0 || kind == FW_STEPPED) return -EINVAL;
     int64_t look_ns = db->header->tick_ns / 4 < 5000000 ? db->header->tick_ns / 4 : 5000000;
     int r;
-    while ((r = fw_clock_take(db)) == -EBUSY && !*stop) fw_platform_sleep_until(fw_platform_monotonic_ns() + look_ns);
-    if (r < 0) return *stop && r == -EBUSY ? 0 : r;
-    while (!fw_cycle(db) && !*stop && !all_here(db, wait_for, n)) {
+    while ((r = fw_clock_take(db)) == -EBUSY && !is_stopped(stop)) fw_platform_sleep_until(fw_platform_monotonic_ns() + look_ns);
+    if (r < 0) return is_stopped(stop) && r == -EBUSY ? 0 : r;
+    while (!fw_cycle(db) && !is_stopped(stop) && !all_here(db, wait_for, n)) {
         r = fw_wait_directory(db, fw_directory_version(db), look_ns);
         if (r < 0 && r != -ETIMEDOUT && r != -EINTR) return r;
     }
@@ -250,7 +264,7 @@ int fw_clock_start(fw_clock_thread **out, const char *name, const char *const *w
 void fw_clock_forget(fw_clock_thread *clock) { thread_free(clock); }
 
 int fw_clock_stop(fw_clock_thread *clock) {
-    clock->stop = 1;
+    __atomic_store_n(&clock->stop, 1, __ATOMIC_RELAXED);
     pthread_join(clock->thread, NULL);
     int r = clock->result;
     thread_free(clock);

@@ -42,7 +42,7 @@ static void health_begin(fw_db *db, uint32_t component, const char *version) {
     spec.schema = (uint32_t)schema;
     self->health = fw_find(db, spec.name);
     fw_object known;
-    if (self->health >= 0 && (fw_object_get(db, self->health, &known) < 0 || known.spec.schema != spec.schema)) return;
+    if (self->health >= 0 && (fw_object_get(db, self->health, &known) < 0 || known.spec.schema != spec.schema)) { self->health = -ENOENT; return; }
     if (self->health < 0) self->health = fw_insert(db, &spec);
     self->state = (fw_health){.pid = getpid(), .state = 1};
     snprintf(self->state.version, sizeof self->state.version, "%s", version);
@@ -129,7 +129,7 @@ static void take_over(fw_db *db, uint32_t component) {
         fw_ref *ref = &db->refs[i];
         if (fw_ref_fill(db, i) < 0 || ref->component != component) continue;
         fw_ring_writable(db, ref, 1);
-        if (!FW_LOAD(db->life[i].deleted, relaxed)) continue;
+        if (!FW_LOAD(db->life[i].deleted, relaxed)) { fw_restamp(ref); continue; }
         FW_STORE(ref->ring->released, 1, release); /* the one who might have been writing it is gone */
         fw_ring_writable(db, ref, 0);
     }
@@ -139,6 +139,7 @@ static int join_locked(fw_db *db, const char *name, const fw_join_opts *opts) {
     int i = component_find(db, name);
     uint32_t n = fw_n_components(db);
     if (i < 0) i = n < db->header->max_components ? (int)n : component_vacant(db);
+    if (i < 0) { fw_make_room(db); i = component_vacant(db); }
     if (i < 0) return i;
     if (db->self[i].owned) return -EBUSY;
     int r = fw_lock(db, FW_LOCK_COMPONENT + i, F_WRLCK);
@@ -177,7 +178,7 @@ int fw_leave(fw_db *db, uint32_t component) {
     db->self[component].owned = 0;
     db->n_owned--;
     for (uint32_t i = 0, n = fw_n_entries(db); i < n; i++) /* what was begun is not committed after coming back */
-        if (db->refs[i].life && db->refs[i].component == component) {
+        if (db->refs[i].life && db->refs[i].component == component && FW_LOAD(db->life[i].life, relaxed) == db->refs[i].life) {
             db->refs[i].begun = 0;
             db->refs[i].public_mapped = 0;
             fw_ring_writable(db, &db->refs[i], 0);

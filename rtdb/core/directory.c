@@ -123,14 +123,26 @@ int fw_ref_get(const fw_db *db, fw_handle object, fw_ref **out) {
     if (object < 0 || i >= db->header->max_objects) return -ENOENT;
     uint64_t life = ((uint64_t)object >> 32) * 2 + 1;
     *out = &db->refs[i];
-    if ((*out)->life == life) return 0;
+    if ((*out)->life == life && FW_LOAD(db->life[i].life, relaxed) == life) return 0;
     int r = fw_ref_fill((fw_db *)(uintptr_t)db, i); /* the memory of this process only */
     if (r == -EPROTO) return r;
     return (*out)->life == life ? 0 : FW_LOAD(db->life[i].life, relaxed) > life ? -EIDRM : -ENOENT;
 }
 
 void fw_ring_writable(fw_db *db, const fw_ref *ref, int on) {
-    fw_writable(db, (uint64_t)((uint8_t *)ref->ring - db->base), fw_ring_bytes(ref->stride, ref->n_slots), on);
+    uint64_t off = (uint64_t)((uint8_t *)ref->ring - db->base), end = fw_round_up(off + fw_ring_bytes(ref->stride, ref->n_slots), FW_PAGE);
+    fw_writable(db, off, end - off, on);
+    if (on || db->fd < 0) return;
+    off = off / FW_PAGE * FW_PAGE;
+    for (uint32_t i = 0, n = fw_n_entries(db); i < n; i++) { /* in a damaged store rings may overlap: what is ours stays so */
+        fw_ref *o = &db->refs[i];
+        if (o == ref || !o->life || FW_LOAD(db->life[i].life, relaxed) != o->life || FW_LOAD(db->life[i].deleted, relaxed)) continue;
+        uint64_t at = (uint64_t)((uint8_t *)o->ring - db->base), bytes = fw_ring_bytes(o->stride, o->n_slots);
+        if (at / FW_PAGE * FW_PAGE >= end || at + bytes <= off) continue;
+        o->public_mapped = 0;
+        if (db->self[o->component].owned) fw_writable(db, at, bytes, 1);
+    }
+    if (db->has_clock && end > db->cuts_mapped) fw_writable(db, db->cuts_mapped, db->map.size - db->cuts_mapped, 1);
 }
 
 static uint64_t hash_of(const char *name) { /* FNV-1a */
@@ -198,7 +210,7 @@ static void clear_cuts(fw_db *db, const fw_oentry *e) {
 static void mark_ring(fw_db *db, const fw_oentry *e, int used) { /* whole pages: what a process may write */
     uint64_t unit = heap_unit(db), first = e->ring_off / unit * unit;
     if (first < db->map.heap) first = db->map.heap;
-    mark(db, first, e->ring_off + ring_bytes(e) - first, used);
+    mark(db, first, fw_round_up(e->ring_off + ring_bytes(e), unit) - first, used);
 }
 
 static void do_insert(fw_db *db, const fw_intent *t) {
@@ -218,14 +230,14 @@ static void do_insert(fw_db *db, const fw_intent *t) {
     FW_STORE(db->life[i].deleted, 0, relaxed);
     FW_STORE(db->life[i].parent, e->spec.flags & FW_WITH_PARENT ? e->spec.parent : 0, relaxed);
     STEP();
-    FW_STORE(db->life[i].life, e->life, release); /* from here on it is there */
+    if (e->ring_off + ring_bytes(e) > FW_LOAD(db->dir->heap_low, relaxed))
+        FW_STORE(db->dir->heap_low, fw_round_up(e->ring_off + ring_bytes(e), heap_unit(db)), relaxed);
+    if (e->cuts_off < FW_LOAD(db->dir->heap_high, relaxed)) FW_STORE(db->dir->heap_high, e->cuts_off, release);
+    STEP();
+    FW_STORE(db->life[i].life, e->life, release); /* from here on it is there; the clock maps its cut log: with refresh */
 counts:
     STEP();
     FW_STORE(db->hash[i], hash_of(e->spec.name), release);
-    if (e->ring_off + ring_bytes(e) > FW_LOAD(db->dir->heap_low, relaxed))
-        FW_STORE(db->dir->heap_low, fw_round_up(e->ring_off + ring_bytes(e), db->map.granule), relaxed);
-    if (e->cuts_off < FW_LOAD(db->dir->heap_high, relaxed)) FW_STORE(db->dir->heap_high, e->cuts_off, release);
-    STEP();
     if (FW_LOAD(db->dir->next_oid, relaxed) <= e->oid) FW_STORE(db->dir->next_oid, e->oid + 1, relaxed);
     if (FW_LOAD(db->dir->next_life, relaxed) <= e->life / 2) FW_STORE(db->dir->next_life, e->life / 2 + 1, relaxed);
     STEP();
@@ -236,10 +248,11 @@ static void delete_one(fw_db *db, uint32_t i, const fw_intent *t) {
     db->death[i].t_ns = t->t_ns;
     STEP();
     FW_STORE(db->hash[i], 0, relaxed);
-    FW_STORE(db->life[i].deleted, t->cycle + 1, relaxed);
+    uint64_t deleted = t->cycle < UINT64_MAX ? t->cycle + 1 : UINT64_MAX;
+    FW_STORE(db->life[i].deleted, deleted, relaxed);
     STEP();
     FW_FENCE(seq_cst); /* a tick that does not see this is at most the one after the cycle read here: with fw_tick */
-    db->death[i].spent_cycle = fw_cycle(db) + 1;
+    db->death[i].spent_cycle = fw_cycle(db) + 1 > deleted ? fw_cycle(db) + 1 : deleted;
     STEP();
 }
 
@@ -251,7 +264,8 @@ static void do_delete(fw_db *db, const fw_intent *t) {
         found = 0;
         for (uint32_t i = 0; i < n; i++) {
             uint64_t parent = FW_LOAD(db->life[i].parent, relaxed);
-            if (!parent || FW_LOAD(db->life[i].life, relaxed) % 2 == 0 || FW_LOAD(db->life[i].deleted, relaxed)) continue;
+            if (!parent || FW_LOAD(db->life[i].life, relaxed) % 2 == 0 ||
+                (FW_LOAD(db->life[i].deleted, relaxed) && db->death[i].spent_cycle >= FW_LOAD(db->life[i].deleted, relaxed))) continue;
             for (uint32_t k = 0; k < n; k++)
                 if (FW_LOAD(db->life[k].life, relaxed) % 2 && FW_LOAD(db->life[k].deleted, relaxed) &&
                     db->objects[k].oid == parent) { delete_one(db, i, t); found = 1; break; }
@@ -376,6 +390,25 @@ static void delete_abandoned(fw_db *db) {
     }
 }
 
+static void delete_locked(fw_db *db, fw_handle object, fw_ref *ref) {
+    fw_intent *t = &db->dir->intent;
+    int mine = is_mine(db, ref->component);
+    if (mine && !(ref->flags & FW_PUBLIC_WRITE)) FW_STORE(ref->ring->released, 1, release); /* this process writes it no more */
+    ref->begun = 0;
+    t->entry = fw_index_of(object);
+    t->cycle = fw_cycle(db);
+    t->t_ns = fw_now_ns(db);
+    decide(db, FW_DELETE);
+    if (mine) fw_ring_writable(db, ref, 0);
+    for (uint32_t k = 0, n = fw_n_entries(db); k < n; k++) /* with all that went with it */
+        if (FW_LOAD(db->life[k].deleted, relaxed)) fw_tell(db, &db->object_wake[k]);
+}
+
+void fw_make_room(fw_db *db) {
+    delete_abandoned(db);
+    free_spent(db);
+}
+
 static int lives(const fw_db *db, uint64_t oid) {
     for (uint32_t i = 0, n = fw_n_entries(db); i < n; i++)
         if (FW_LOAD(db->life[i].life, relaxed) % 2 && !FW_LOAD(db->life[i].deleted, relaxed) && db->objects[i].oid == oid) return 1;
@@ -383,7 +416,9 @@ static int lives(const fw_db *db, uint64_t oid) {
 }
 
 static fw_handle insert_locked(fw_db *db, const fw_spec *spec) {
-    if (fw_find(db, spec->name) >= 0) return -EEXIST;
+    fw_handle old = fw_find(db, spec->name);
+    fw_ref *ref = NULL;
+    if (old >= 0 && (!(spec->flags & FW_REPLACE) || fw_ref_get(db, old, &ref) < 0 || ref->component != spec->component)) return -EEXIST;
     if (spec->parent && !lives(db, spec->parent)) return -EIDRM;
     uint32_t n = fw_n_entries(db), i = 0;
     while (i < n && FW_LOAD(db->life[i].life, relaxed) % 2) i++;
@@ -393,11 +428,13 @@ static fw_handle insert_locked(fw_db *db, const fw_spec *spec) {
     if (life >> 32) return -ENOSPC; /* two thousand million inserts */
     fw_oentry e = {.spec = *spec, .life = life, .oid = FW_LOAD(db->dir->next_oid, relaxed),
                    .t_insert_ns = fw_now_ns(db), .stride = (uint32_t)slot_bytes(spec)};
+    e.spec.flags &= ~FW_REPLACE;
     int64_t period_ns = (int64_t)spec->every * fw_tick_ns(db);
     if (!e.spec.t_history_ns) e.spec.t_history_ns = period_ns * spec->n_slots;
     if (!e.spec.min_cycle_ns) e.spec.min_cycle_ns = period_ns;
     int r = place(db, &e, i, ring_bytes(&e), cuts_bytes(&e));
     if (r < 0) return r;
+    if (old >= 0) delete_locked(db, old, ref);
     t->entry = i;
     t->object = e;
     decide(db, FW_INSERT);
@@ -414,8 +451,7 @@ fw_handle fw_insert(fw_db *db, const fw_spec *spec) {
     free_spent(db);
     fw_handle h = insert_locked(db, spec);
     if (h == -ENOSPC) {
-        delete_abandoned(db);
-        free_spent(db);
+        fw_make_room(db);
         h = insert_locked(db, spec);
     }
     fw_ref *ref;
@@ -432,25 +468,11 @@ int fw_delete(fw_db *db, fw_handle object) {
     uint32_t i = fw_index_of(object);
     r = fw_ref_get(db, object, &ref);
     if (r == 0 && FW_LOAD(db->life[i].deleted, relaxed)) r = -EIDRM;
-    int mine = r == 0 && is_mine(db, ref->component);
-    if (r == 0 && !mine && !(ref->flags & FW_PUBLIC_WRITE) && !is_gone(db, ref->component)) r = -EPERM;
-    if (r == 0) {
-        fw_intent *t = &db->dir->intent;
-        if (mine && !(ref->flags & FW_PUBLIC_WRITE)) FW_STORE(ref->ring->released, 1, release); /* this process writes it no more */
-        ref->begun = 0;
-        t->entry = i;
-        t->cycle = fw_cycle(db);
-        t->t_ns = fw_now_ns(db);
-        decide(db, FW_DELETE);
-        if (mine) fw_ring_writable(db, ref, 0);
-    }
-    uint32_t n = fw_n_entries(db);
+    if (r == 0 && !is_mine(db, ref->component) && !(ref->flags & FW_PUBLIC_WRITE) && !is_gone(db, ref->component)) r = -EPERM;
+    if (r == 0) delete_locked(db, object, ref);
     fw_directory_close(db);
-    if (r < 0) return r;
-    for (uint32_t k = 0; k < n; k++)
-        if (FW_LOAD(db->life[k].deleted, relaxed)) fw_tell(db, &db->object_wake[k]);
-    fw_tell(db, &db->wake->directory);
-    return 0;
+    if (r == 0) fw_tell(db, &db->wake->directory);
+    return r;
 }
 
 /* -- schemas -------------------------------------------------------------------------------------------------------- */

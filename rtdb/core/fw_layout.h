@@ -58,6 +58,8 @@ typedef struct {
     uint32_t participant, every, phase, pad;
 } fw_centry;
 
+#define FW_REPLACE (1u << 31) /* flag of fw_insert alone: an object of this name and owner is deleted, if the new one fits */
+
 enum { FW_NOTHING, FW_INSERT, FW_DELETE, FW_FREE };
 
 typedef struct {
@@ -134,7 +136,7 @@ struct fw_db {
     fw_ref *refs;         /* [max_objects] */
     fw_self *self;        /* [max_components] */
     uint64_t version;     /* of the directory, when the clock's refs were last brought up to date */
-    uint32_t n_owned;
+    uint32_t n_owned, n_ticked;
     int fd;               /* -1 = private */
     int creator, has_clock, can_wake;
     uint64_t cuts_mapped; /* shared, for the clock: cut logs from this offset on are writable here */
@@ -161,6 +163,7 @@ int fw_lock_held(const fw_db *db, int64_t byte);
 #define FW_LOCK_ALIVE 0
 #define FW_LOCK_DIRECTORY 1
 #define FW_LOCK_CLOCK 2
+#define FW_LOCK_MARK 3 /* of the life logs, for who marks the dead without a clock */
 #define FW_LOCK_COMPONENT 16
 #define FW_LOCK_OBJECT 65552 /* behind the components */
 
@@ -172,13 +175,21 @@ uint64_t fw_ring_bytes(uint32_t stride, uint32_t n_slots);
 int fw_name_ok(const char *name);
 int fw_directory_open(fw_db *db);
 void fw_directory_close(fw_db *db);
+/* Deletes what dead components left, and gives away what nobody uses any more. Under the directory lock. */
+void fw_make_room(fw_db *db);
 /* objects.c */
 int fw_repeatable_only(const fw_db *db);
+/* Takes the stamps of the ring from its newest write: who wrote before may have been killed in mid-write. */
+void fw_restamp(fw_ref *ref);
 /* components.c */
 int fw_component_alive(const fw_db *db, uint32_t component);
 void fw_health_step(fw_db *db, uint32_t component, uint64_t cycle);
 fw_cuts *fw_life_log(const fw_db *db, uint32_t component);
 /* wait.c */
+/* fw_wait_write, but at most until a host time: then -EAGAIN, and the next call goes on with dead_since_ns (0 at first). */
+int64_t fw_wait_write_until(fw_db *db, fw_handle object, uint64_t after, int64_t t_ns, int64_t host_ns, int64_t *dead_since_ns);
+/* The host time at which a wait until a store time ends at the latest: whoever ticks a store does not tick while it waits. */
+int64_t fw_host_limit(const fw_db *db, int64_t t_ns);
 /* Wakes who waits for the word. */
 void fw_tell(fw_db *db, fw_u32 *word);
 /* Waits for a word until `ready` says so (not 0: it is what is returned) or until a host time. */

@@ -15,11 +15,15 @@ static fw_life *life_of(const fw_db *db, fw_handle object) { return &db->life[fw
 /* Whether this process may write the object now; the next write number. */
 static int64_t may_write(fw_db *db, fw_handle object, fw_ref *ref) {
     if (FW_LOAD(life_of(db, object)->deleted, relaxed)) {
-        if (!(ref->flags & FW_PUBLIC_WRITE) && db->self[ref->component].owned && !FW_LOAD(ref->ring->released, relaxed))
+        if (!(ref->flags & FW_PUBLIC_WRITE) && db->self[ref->component].owned && !FW_LOAD(ref->ring->released, relaxed)) {
+            fw_ring_writable(db, ref, 1);
             FW_STORE(ref->ring->released, 1, release); /* we shall not touch it again: its storage may go */
+            fw_ring_writable(db, ref, 0);
+        }
         return -EIDRM;
     }
     uint64_t w = FW_LOAD(ref->ring->head, relaxed) + 1;
+    if (w >= INT64_MAX) return -EPROTO;
     if (fw_may_write(ref->ring, ref->cuts, &db->clock->edge, w, ref->n_slots) &&
         !(ref->flags & FW_CYCLE_WATCH && w > 1 &&
           fw_now_ns(db) - (int64_t)FW_LOAD(ref->ring->t_commit_ns, relaxed) < ref->min_cycle_ns)) return (int64_t)w;
@@ -45,6 +49,13 @@ static void publish(fw_db *db, fw_handle object, fw_ref *ref, uint64_t w, uint64
     if (n_causes) fw_copy_in(slot + 1, causes, (uint32_t)sizeof(fw_cause) * n_causes);
     fw_slot_publish(ref->ring, slot, &db->clock->edge, w);
     if (!(ref->flags & FW_NO_NOTIFY)) fw_tell(db, &db->object_wake[fw_index_of(object)]);
+}
+
+void fw_restamp(fw_ref *ref) {
+    uint64_t head = FW_LOAD(ref->ring->head, relaxed);
+    fw_slot *slot = slot_of(ref, head);
+    FW_STORE(ref->ring->t_data_ns, head ? FW_LOAD(slot->t_data_ns, relaxed) : 0, relaxed);
+    FW_STORE(ref->ring->t_commit_ns, head ? FW_LOAD(slot->t_commit_ns, relaxed) : 0, relaxed);
 }
 
 static int fits(fw_ref *ref, uint32_t n, int64_t t_data_ns, uint32_t n_causes) {
@@ -108,6 +119,7 @@ static int64_t write_public(fw_db *db, fw_handle object, fw_ref *ref, const void
     }
     if (r < 0) return r;
     if (!ref->public_mapped) { fw_ring_writable(db, ref, 1); ref->public_mapped = 1; }
+    fw_restamp(ref);
     uint32_t writer = ref->component;
     for (uint32_t i = 0; !db->self[writer].owned && i < fw_n_components(db); i++)
         if (db->self[i].owned) { writer = i; break; }

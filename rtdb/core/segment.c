@@ -34,6 +34,8 @@ static int map_of(const fw_header *h, fw_map *m) {
     m->size = h->size;
     if (m->heap + FW_PAGE > h->size || h->size % FW_PAGE) return -EPROTO;
     for (m->granule = 64; m->granule * FW_GRANULES < m->size - m->heap; m->granule *= 2) ;
+    m->heap = fw_round_up(m->heap, m->granule < FW_PAGE ? FW_PAGE : m->granule);
+    if (m->heap + FW_PAGE > h->size) return -EPROTO;
     return 0;
 }
 
@@ -55,6 +57,8 @@ static int bind(fw_db *db) {
     db->lives = db->base + m->lives;
     db->cuts_mapped = m->size;
     db->version = UINT64_MAX;
+    if (db->fd >= 0) /* an area of its own to the kernel: opening and closing it for a change splits and joins none */
+        madvise(db->base + m->directory, m->components - m->directory, MADV_DONTDUMP);
     db->refs = calloc(db->header->max_objects, sizeof(fw_ref));
     db->self = calloc(db->header->max_components, sizeof(fw_self));
     return db->refs && db->self ? 0 : -ENOMEM;

@@ -72,19 +72,21 @@ class Peer:
 
     def answer(self) -> str:
         """Wait for the result: the repr of a value, or "!Kind: message" of an exception."""
+        if not self.has_answered(2 * LONG_S):
+            raise TimeoutError("the other process waits for ever")
         return self.process.stdout.readline().rstrip("\n")
 
-    def has_answered(self) -> bool:
+    def has_answered(self, within_s: float = 0.0) -> bool:
         """Whether `answer` would return at once."""
-        return bool(select.select([self.process.stdout], [], [], 0)[0])
+        return bool(select.select([self.process.stdout], [], [], within_s)[0])
 
     def __call__(self, statement: str) -> str:
         self.send(statement)
         return self.answer()
 
     def until_it_waits(self) -> None:
-        """Return when the process sleeps on a futex, as it does inside the store's wait calls."""
-        while True:
+        """Return when the process sleeps on a futex, as it does inside the store's wait calls (or has answered)."""
+        while not self.has_answered():
             number = Path(f"/proc/{self.process.pid}/syscall").read_text().split()[0]
             if number == "202":  # futex on x86-64
                 return

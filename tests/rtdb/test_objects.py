@@ -226,7 +226,6 @@ def test_an_object_with_other_times_replaces_what_a_predecessor_left(store, chan
 
 
 def test_a_replacement_that_does_not_fit_leaves_what_was_there(store):
-    # fails: Component.insert deletes the old object before it knows that the new one fits
     a = store.join("a")
     writer = a.insert("n", Count)
     writer.write(Count(1))
@@ -629,12 +628,16 @@ def test_two_processes_that_write_a_public_object_at_once_lose_and_tear_nothing(
         writer(f"me = store.join({component!r})\nlog = store.writer('owner/log', Words)")
         writer.send(
             f"store.wait_cycle(0, {LONG_S})\n"
-            f"[log.write(Words((k,) * 64)) for k in range({PUBLIC_WRITES})] == sorted(range({PUBLIC_WRITES}))"
+            "k = 0\n"
+            f"while k < {PUBLIC_WRITES}:\n"
+            "    try: log.write(Words((k,) * 64))\n"
+            "    except TooFast: continue  # the other one was stopped in mid write\n"
+            "    k += 1"
         )
         writer.until_it_waits()
     shared.tick()
     for writer in writers.values():
-        assert writer.answer() in {"True", "False"}
+        assert writer.answer() == "None"
     assert log.head == 2 * PUBLIC_WRITES
     seen = {"one": [], "two": []}
     for w in range(1, log.head + 1):
@@ -652,7 +655,8 @@ def test_a_process_killed_while_it_writes_a_public_object_stops_nobody(shared, a
         writer.send("while True: log.write(Words((7,) * 64))")
         after = log.head
         while log.head < after + 100:
-            log.wait(log.head, LONG_S)
+            assert not writer.has_answered()
+            shared.wait_cycle(shared.cycle, 0.001)
         writer.kill()
         log.write(Words((k,) * 64))
         assert set(log.latest().value.words) == {k}
@@ -720,6 +724,21 @@ def test_what_a_dead_component_left_makes_room_in_the_heap():
         assert left.t_delete_ns is None
         tick(store, 5000)
         assert names([living.insert("large", Words, history_s=50.0), *store.objects()]) == ["living/large"] * 2
+
+
+def test_what_a_living_component_has_makes_no_room_however_long_it_is_silent(name, peer):
+    with Store.create(name, max_objects=4) as store:
+        silent = peer()
+        silent(f"store = Store.attach({name!r})\nw = store.join('silent').insert('n', Count, history_s=0.01)")
+        me = store.join("me")
+        me.insert("n", Count)
+        assert len(store.objects()) == 4
+        silent("w.write(Count(1))")
+        tick(store, 1000)
+        with pytest.raises(StoreFull, match="me/more"):
+            me.insert("more", Count)
+        assert [obj.name for obj in store.objects()] == ["silent/health", "silent/n", "me/health", "me/n"]
+        assert silent("w.write(Count(2))") == "2"
 
 
 def test_who_holds_no_clock_gets_the_room_of_the_dead_behind_the_next_tick(name, peer):

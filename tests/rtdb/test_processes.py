@@ -433,7 +433,6 @@ def test_an_old_cut_goes_on_saying_that_a_component_lived_when_it_is_dead(store,
 
 @pytest.mark.parametrize("kind", ["private", "shared"])
 def test_an_old_cut_goes_on_saying_that_a_component_lived_when_it_has_left(kind, unique):
-    # fails in a private store, which only knows who lives now
     with Store.create(unique() if kind == "shared" else None) as store:
         component = store.join("w")
         store.tick()
@@ -597,8 +596,6 @@ def test_the_locks_of_a_killed_parent_are_free_although_its_child_lives(name, pe
 
 
 def test_the_clock_of_a_killed_parent_is_free_although_its_child_lives(name, peer, unique):
-    # fails: the clock's thread has an attachment of its own, which the child inherits and never lets go of, so that
-    # the clock counts as alive and no standby takes over
     with Store.create(name, clock="barrier") as store:
         me = store.join("me", participant=True)
         cycles = me.cycles(LONG_S)

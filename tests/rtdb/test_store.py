@@ -493,7 +493,6 @@ def test_a_period_that_is_not_positive_is_refused(store, every):
 
 @pytest.mark.parametrize("wrong", [{"every": 2**32 + 1}, {"n_causes": 2**32}])
 def test_a_number_that_does_not_fit_is_refused_and_not_cut_off(store, wrong):
-    # fails: the binding parses with "I", which takes the lower 32 bits
     a = store.join("a")
     with pytest.raises((RecordError, OverflowError)):
         a.insert("n", Count, **wrong)
@@ -629,7 +628,6 @@ MISTAKES = {
     "data time going backward": (write_late, DataTimeBackward),
     "too many causes": (lambda store, w: w.write(Count(8), causes=((1, 1),)), RecordError),
     "causes without end": (lambda store, w: w.write(Count(8), causes=((1, 1),) * 9), (RecordError, ValueError)),
-    # the next two fail: SystemError, the binding expects tuples and does not look
     "a list of causes": (lambda store, w: w.write(Count(8), causes=[(1, 1)]), (RecordError, TypeError)),
     "half a cause": (lambda store, w: w.write(Count(8), causes=((1,),)), (RecordError, TypeError, ValueError)),
     "a writer that is too fast": (write_until_refused, TooFast),
@@ -797,7 +795,6 @@ def test_what_was_begun_before_a_restore_cannot_be_committed_after_it():
 
 
 def test_a_component_that_joined_after_the_save_is_gone_after_the_restore():
-    # fails: the place of `b` counts as held by this process, so that nobody joins any more
     with Store.create() as store:
         a = store.join("a")
         writer = a.insert("n", Count)
