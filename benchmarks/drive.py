@@ -8,9 +8,12 @@ for every 0.1 s of drive.
 
 import argparse
 import statistics
+import sys
 import tempfile
 import time
 from pathlib import Path
+
+sys.path[0] = str(Path(__file__).parents[1])  # beside this file stands rtdb.py, which is not the package
 
 import filterpy.kalman  # noqa: F401 - imports are not what is measured
 import pybullet

@@ -7,9 +7,12 @@
 
 import argparse
 import statistics
+import sys
 import tempfile
 import time
 from pathlib import Path
+
+sys.path[0] = str(Path(__file__).parents[1])  # beside this file stands rtdb.py, which is not the package
 
 from rtdb.recording import Recording
 from scenarios.judge import judge
