@@ -409,9 +409,15 @@ void fw_make_room(fw_db *db) {
     free_spent(db);
 }
 
-static int lives(const fw_db *db, uint64_t oid) {
-    for (uint32_t i = 0, n = fw_n_entries(db); i < n; i++)
-        if (FW_LOAD(db->life[i].life, relaxed) % 2 && !FW_LOAD(db->life[i].deleted, relaxed) && db->objects[i].oid == oid) return 1;
+/* Whether the object of that id lives, and still will when the one in entry `goes` was deleted. */
+static int stays(const fw_db *db, uint64_t oid, uint32_t goes) {
+    uint32_t n = fw_n_entries(db);
+    for (uint32_t depth = 0; depth <= n; depth++) {
+        uint32_t i = 0;
+        while (i < n && (FW_LOAD(db->life[i].life, relaxed) % 2 == 0 || FW_LOAD(db->life[i].deleted, relaxed) || db->objects[i].oid != oid)) i++;
+        if (i == n || i == goes) return depth > 0 && i == n;
+        if (goes == UINT32_MAX || !(oid = FW_LOAD(db->life[i].parent, relaxed))) return 1;
+    }
     return 0;
 }
 
@@ -419,7 +425,7 @@ static fw_handle insert_locked(fw_db *db, const fw_spec *spec) {
     fw_handle old = fw_find(db, spec->name);
     fw_ref *ref = NULL;
     if (old >= 0 && (!(spec->flags & FW_REPLACE) || fw_ref_get(db, old, &ref) < 0 || ref->component != spec->component)) return -EEXIST;
-    if (spec->parent && !lives(db, spec->parent)) return -EIDRM;
+    if (spec->parent && !stays(db, spec->parent, old >= 0 ? fw_index_of(old) : UINT32_MAX)) return -EIDRM;
     uint32_t n = fw_n_entries(db), i = 0;
     while (i < n && FW_LOAD(db->life[i].life, relaxed) % 2) i++;
     if (i >= db->header->max_objects) return -ENOSPC;

@@ -209,10 +209,9 @@ class StoreMachine(RuleBasedStateMachine):
         history_ns = slots * every * TICK_NS
         spec = every, phase, slots, flags, below.oid if below else 0, history_ns
         known = self.living(f"a/o{name}")
-        if known is not None and self.models[known].spec != spec:
-            self.model_delete(known)
-        orphan = above is not None and above.deleted  # it went with what is replaced
-        if known is None or (self.models[known].deleted and not orphan):
+        replaces = known is not None and self.models[known].spec != spec
+        orphan = above is not None and replaces and self.goes_with(above, known)
+        if known is None or replaces:
             for model in self.models:
                 model.freed = model.freed or model.is_over(self.now)
         full = sum(not model.freed for model in self.models) == MAX_OBJECTS
@@ -231,15 +230,28 @@ class StoreMachine(RuleBasedStateMachine):
         except (StoreFull, Deleted) as error:
             assert orphan if isinstance(error, Deleted) else full  # noqa: PT017
             return
-        if known is not None and not self.models[known].deleted:
+        if known is not None and not replaces:
             assert handle == self.handles[known]
             return
+        if replaces:
+            self.model_delete(known)
         assert not full
         assert not orphan
         assert (handle.n_slots, handle.head) == (slots, 0)
         assert all(handle.oid > model.oid for model in self.models if not model.freed)
         self.handles.append(handle)
         self.models.append(Model(f"a/o{name}", spec, handle.oid, self.now))
+
+    def goes_with(self, model, k):
+        """Whether the deletion of k takes a model along, or is its own."""
+        while model is not None:
+            if model is self.models[k]:
+                return True
+            if not model.flags & Flag.WITH_PARENT:
+                return False
+            above = [m for m in self.models if m.oid == model.parent and not m.deleted and not m.freed]
+            model = above[0] if above else None
+        return False
 
     def model_delete(self, k):
         self.models[k].deleted = self.store.cycle, self.now
