@@ -48,6 +48,7 @@ def drive(
     ] = "p545/field-trial",
     seed: Annotated[int, typer.Option(help="Seed of all randomness.", min=0)] = 0,
     level: Annotated[str, typer.Option(help="direct (messages) or wire (true bytes).")] = "wire",
+    plant: Annotated[str, typer.Option(help="compiled, or python: the readable form, for reading along.")] = "compiled",
     out: Annotated[Path, typer.Option(help="Folder for runs.")] = Path("runs"),
     use: Annotated[
         list[str] | None, typer.Option(help="COMPONENT=FILE.py:Class swaps one module of the stack.")
@@ -78,6 +79,8 @@ def drive(
 
     if level not in ("direct", "wire"):
         raise typer.BadParameter(f"{level!r} is not one of direct, wire", param_hint="--level")
+    if plant not in ("compiled", "python"):
+        raise typer.BadParameter(f"{plant!r} is not one of compiled, python", param_hint="--plant")
     if by_hand and not sys.stdin.isatty():
         raise typer.BadParameter("the keyboard is needed: standard input is not a terminal", param_hint="--by-hand")
     plan = load_scenario(scenario)
@@ -85,7 +88,8 @@ def drive(
     folder = out / plan.id / str(seed)
     folder.mkdir(parents=True, exist_ok=True)
     setup = Setup(
-        scenario=plan, seed=seed, level=level, stack=stack, db=db, by_hand=by_hand, shuffle=shuffle,  # type: ignore[arg-type]
+        scenario=plan, seed=seed, level=level, plant=plant, stack=stack, db=db,  # type: ignore[arg-type]
+        by_hand=by_hand, shuffle=shuffle,
     )  # fmt: skip
     console = Console()
     if by_hand:

@@ -14,7 +14,7 @@ from rtdb.errors import RecordingError
 from rtdb.recording import Recording, parser_of
 from rtdb.records import Field
 
-METADATA = ("scenario", "site", "seed", "level", "version", "format", "tick_ns", "t0_ns")
+METADATA = ("scenario", "site", "seed", "level", "plant", "version", "format", "tick_ns", "t0_ns")
 Key = tuple[int, str, int]  # cycle, object, write number
 Row = tuple[Key, int, bytes]  # data time since the start, payload
 Decode = Callable[[str, bytes], dict[str, Any]]

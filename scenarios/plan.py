@@ -11,7 +11,7 @@ from hal.faults import Corruption, HostSilence
 from hal.signals import Course, FaultEvent, ObstacleKind
 from hal.signals import Site as SiteRecord
 from sim.actors import Actor
-from sim.cart import Outage, SimSetup, Start
+from sim.cart import Outage, PlantKind, SimSetup, Start
 from sim.laser import LaserParams
 from sim.site import Site
 
@@ -61,7 +61,7 @@ def course_record(scenario: Scenario, site: Site, rng: Rng) -> Course:
     )
 
 
-def sim_setup(scenario: Scenario, site: Site, level: Level, rng: Rng) -> SimSetup:
+def sim_setup(scenario: Scenario, site: Site, level: Level, plant: PlantKind, rng: Rng) -> SimSetup:
     """Give the simulated cart: it starts near its mark, as well as the crew puts it there."""
     mark, drawn, laser = scenario.start, rng("start").normal(size=3), scenario.laser
     return SimSetup(
@@ -73,6 +73,7 @@ def sim_setup(scenario: Scenario, site: Site, level: Level, rng: Rng) -> SimSetu
         ),
         t_ns=scenario.t0_ns,
         level=level,
+        plant=plant,
         gps_grade=scenario.gps.grade,
         outages=tuple(
             Outage(at(scenario, f.at_s), at(scenario, f.at_s + f.for_s))

@@ -44,7 +44,7 @@ from hal.signals import (
 from hal.signals import Site as SiteRecord
 from rtdb import STATIC, Object, Record, Store
 from rtdb.recorder import Recorder
-from sim.cart import GPS_LATENCY_NS, SimCart
+from sim.cart import GPS_LATENCY_NS, PlantKind, SimCart
 
 from . import plan
 from .by_hand import HandHost, by_hand
@@ -68,13 +68,15 @@ Placement = Literal["inline", "process"]
 class Setup:
     """How to run a scenario.
 
-    db: name of a shared store, None for a private one; placement: where modules run; by_hand: the keyboard drives;
-    shuffle: seed that permutes order, placement over processes and delays, none of which may change the trace.
+    plant: python is the readable form of the cart's dynamics; db: name of a shared store, None for a private one;
+    placement: where modules run; by_hand: the keyboard drives; shuffle: seed that permutes order, placement over
+    processes and delays, none of which may change the trace.
     """
 
     scenario: Scenario
     seed: int = 0
     level: Level = "wire"
+    plant: PlantKind = "compiled"
     stack: Stack | None = None
     db: str | None = None
     placement: Placement = "inline"
@@ -125,7 +127,7 @@ class Drive:
         except CourseImpossible as error:
             raise DriveError(str(error), invalid=True) from error
         self._write_mission(plan.site_record(site), course)
-        self.sim = SimCart(plan.sim_setup(scenario, site, self.setup.level, rng), rng)
+        self.sim = SimCart(plan.sim_setup(scenario, site, self.setup.level, self.setup.plant, rng), rng)
         self.sim.bus.faults += plan.bus_faults(scenario, rng)
         self._events = plan.fault_events(scenario)
         self._write_world()
@@ -340,6 +342,7 @@ def drive(
         "scenario": scenario.id,
         "seed": str(setup.seed),
         "level": setup.level,
+        "plant": setup.plant,
         "site": scenario.site,
         "version": version(),
     }

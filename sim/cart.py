@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from hal.signals import ActorsTruth, CartTruth, Clearance, FixQuality, LocalPlan
 
 from .actors import Actor
 from .compass_error import CompassError, CompassParams, declination_rad
+from .compiled import CompiledPlant
 from .gps_error import GPS_GRADES, GpsError
 from .laser import PERIOD_NS as LASER_NS
 from .laser import Laser, LaserParams
@@ -41,6 +43,8 @@ QUALITY = {
     "rtk_float": FixQuality.RTK_FLOAT,
     "rtk_fixed": FixQuality.RTK_FIXED,
 }
+PlantKind = Literal["compiled", "python"]
+PLANTS: dict[PlantKind, Callable[[CartParams], Plant]] = {"compiled": CompiledPlant, "python": PythonPlant}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +66,17 @@ class Start:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimSetup:
-    """What a simulated drive is made of. `compass`: personality of the device; None for none, as with `laser`."""
+    """What a simulated drive is made of.
+
+    plant: python is the readable form, ten times as slow, and equal but for the last bits of its sines; compass:
+    personality of the device; None for none, as with `laser`.
+    """
 
     site: Site
     start: Start
     t_ns: int
     level: Level = "wire"
+    plant: PlantKind = "compiled"
     gps_grade: str = "sbas"
     outages: tuple[Outage, ...] = ()
     compass: str | None = "hmr3000"
@@ -78,11 +87,11 @@ class SimSetup:
 class SimCart:
     """A cart on a site. `rng(name)` gives the random generator of one named sensor."""
 
-    def __init__(self, setup: SimSetup, rng: Callable[[str], np.random.Generator], plant: Plant | None = None) -> None:
+    def __init__(self, setup: SimSetup, rng: Callable[[str], np.random.Generator]) -> None:
         self.setup = setup
         self.bus = CanBus(setup.level)
         params = CartParams()
-        self.plant: Plant = plant or PythonPlant(params)
+        self.plant: Plant = PLANTS[setup.plant](params)
         self.plant.reset(CartState(setup.start.x_m, setup.start.y_m, setup.start.yaw_rad))
         self.safety = SafetyNode(self.bus, setup.t_ns)
         self.steer = SteerNode(self.bus)

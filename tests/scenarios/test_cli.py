@@ -229,6 +229,7 @@ def test_missing_stack_is_one_line(here: Run, short: Path) -> None:
     ("option", "value", "word"),
     [
         ("--level", "os", "direct, wire"),
+        ("--plant", "c", "compiled, python"),
         ("--seed", "-1", "--seed"),
         ("--seed", "x", "--seed"),
         ("--pace", "0", "--pace"),
