@@ -1,6 +1,6 @@
 """`fairway db`: look into a running store. Imports stay inside the commands, so that `--help` is quick.
 
-Everything is shown by the schema that the store holds, so no class is needed. What changes a store is in cli_change.py.
+Everything is shown by the schema that the store holds, so no class is needed. What changes a store is in db/change.py.
 """
 
 from pathlib import Path
@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .cli_change import Db, Name, examples, register
+from .db.change import Db, Name, examples, register
 
 if TYPE_CHECKING:
     from rich.tree import Tree
 
-    from .look import Look, ObjectLook
+    from .db.look import Look, ObjectLook
     from .store import Store
 
 NOTHING = 3  # exit status where nothing is there yet
@@ -36,9 +36,9 @@ def ls(
     import fnmatch
 
     from .components import flag_names
-    from .console import console, table
-    from .look import look
-    from .visit import visit
+    from .db.console import console, table
+    from .db.look import look
+    from .db.visit import visit
 
     with visit(db) as store:
         now = look(store)
@@ -64,9 +64,9 @@ def tree(db: Db = "cart") -> None:
     """Show components, their objects, and the objects below these."""
     from rich.tree import Tree
 
-    from .console import console
-    from .look import look
-    from .visit import visit
+    from .db.console import console
+    from .db.look import look
+    from .db.visit import visit
 
     with visit(db) as store:
         now = look(store)
@@ -124,9 +124,9 @@ def get(
     """Show what an object shows now, with units; or what it showed."""
     import json
 
+    from .db.values import lines_of, part_of, to_json, tokens_of_pointer
+    from .db.visit import find, name_of, oldest_of, visit
     from .errors import AgedOut
-    from .values import lines_of, part_of, to_json, tokens_of_pointer
-    from .visit import find, name_of, oldest_of, visit
 
     if sum(choice is not None for choice in (at, cycle, write)) > 1:
         raise typer.BadParameter("say one of --at, --cycle, --write")
@@ -180,9 +180,9 @@ def watch(
     ] = None,
 ) -> None:
     """Print each new write of an object, until it is deleted or Ctrl-C is pressed."""
-    from .tail import Ended, writes
-    from .values import one_line
-    from .visit import find, visit
+    from .db.tail import Ended, writes
+    from .db.values import one_line
+    from .db.visit import find, visit
 
     left = n
     with visit(db) as store:
@@ -222,9 +222,9 @@ def history(
     import sys
     from contextlib import nullcontext
 
-    from .console import console
-    from .history import columns_of, rows_of, table_of, written
-    from .visit import find, visit
+    from .db.console import console
+    from .db.history import columns_of, rows_of, table_of, written
+    from .db.visit import find, visit
 
     with visit(db) as store:
         obj = find(store, name, or_deleted=True)
@@ -258,9 +258,9 @@ def top(
     """
     from contextlib import ExitStack
 
-    from .console import console
-    from .top import end_of, looks, shown
-    from .visit import visit
+    from .db.console import console
+    from .db.top import end_of, looks, shown
+    from .db.visit import visit
 
     screen = console()
     with visit(db) as store, ExitStack() as open_things:

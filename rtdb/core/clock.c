@@ -180,8 +180,8 @@ static int run_barrier(fw_db *db, const volatile int *stop) {
                                       : fw_wait_directory(db, fw_directory_version(db), 10000000); /* nobody to wait for */
         if (r == 0 && !participants_live(db)) continue;
         if (r == -ETIMEDOUT || r == -EINTR) continue;
-        if (r == 0) r = (int)(fw_tick(db) < 0 ? -EPROTO : 0);
-        if (r < 0) return r;
+        if (r == 0 && (r = tick_to(db, fw_cycle(db) + 1)) == 0) continue;
+        return r;
     }
     return 0;
 }

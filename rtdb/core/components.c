@@ -23,10 +23,12 @@ static const char health_schema[] =
     FIELD("version", "str", "31", "one", "", "of its program", "7", "") ","
     FIELD("status", "str", "160", "one", "", "what it says", "8", "") "]}";
 
+static uint64_t missed_of(const fw_db *db, uint32_t i) { return FW_LOAD(db->missed[i], relaxed) - db->components[i].missed_before; }
+
 static void health_write(fw_db *db, uint32_t component) {
     fw_self *self = &db->self[component];
     if (self->health < 0) return;
-    self->state.missed = FW_LOAD(db->missed[component], relaxed);
+    self->state.missed = missed_of(db, component);
     if (fw_write(db, self->health, &self->state, sizeof self->state, fw_now_ns(db), NULL, 0) > 0) self->told_ns = fw_now_ns(db);
 }
 
@@ -146,6 +148,10 @@ static int join_locked(fw_db *db, const char *name, const fw_join_opts *opts) {
     if (r < 0) return r;
     fw_centry entry = {.pid = getpid(), .participant = opts->participant != 0,
                        .every = opts->every ? opts->every : 1, .phase = opts->phase};
+    const fw_centry *was = &db->components[i];
+    int same = (uint32_t)i < n && strncmp(was->name, name, FW_NAME_MAX) == 0;
+    entry.born_cycle = same ? was->born_cycle : fw_cycle(db);
+    entry.missed_before = same ? was->missed_before : FW_LOAD(db->missed[i], relaxed);
     snprintf(entry.name, sizeof entry.name, "%s", name);
     snprintf(entry.version, sizeof entry.version, "%s", opts->version ? opts->version : "");
     r = fw_put(db, db->map.components + sizeof entry * (uint64_t)i, &entry, sizeof entry);
@@ -192,7 +198,7 @@ int fw_component_get(const fw_db *db, uint32_t i, fw_component *out) {
     if (i >= fw_n_components(db)) return -ENOENT;
     const fw_centry *e = &db->components[i];
     *out = (fw_component){.pid = e->pid, .participant = e->participant != 0, .every = e->every, .phase = e->phase,
-                          .done = FW_LOAD(db->done[i], acquire), .missed = FW_LOAD(db->missed[i], relaxed),
+                          .done = FW_LOAD(db->done[i], acquire), .missed = missed_of(db, i),
                           .alive = fw_component_alive(db, i)};
     memcpy(out->name, e->name, FW_NAME_MAX - 1);
     memcpy(out->version, e->version, sizeof out->version - 1);
@@ -208,6 +214,7 @@ fw_cuts *fw_life_log(const fw_db *db, uint32_t i) {
 int fw_alive_at(const fw_db *db, uint32_t component, uint64_t cycle) {
     if (component >= fw_n_components(db)) return -ENOENT;
     if (cycle > fw_cycle(db)) return -EDOM;
+    if (cycle < db->components[component].born_cycle) return 0;
     int64_t r = fw_cut_find(fw_life_log(db, component), FW_LIVES, cycle);
     return r < 0 ? (int)r : r == 2;
 }

@@ -56,6 +56,7 @@ typedef struct {
     char version[32];
     int64_t pid;
     uint32_t participant, every, phase, pad;
+    uint64_t born_cycle, missed_before; /* a place may have been another's: what came before is not of this name */
 } fw_centry;
 
 #define FW_REPLACE (1u << 31) /* flag of fw_insert alone: an object of this name and owner is deleted, if the new one fits */

@@ -200,7 +200,8 @@ int fw_join(fw_db *db, const char *name, const fw_join_opts *opts);
 int fw_leave(fw_db *db, uint32_t component);
 uint32_t fw_n_components(const fw_db *db);
 int fw_component_get(const fw_db *db, uint32_t component, fw_component *out);
-/* 1 if the component lived at the tick that began a cycle, 0 if not. Repeatable. -EDOM, -ESTALE. */
+/* 1 if the component lived at the tick that began a cycle, 0 if not. Repeatable, but for the current cycle of a store that
+ * nobody ticks: fw_mark_dead may still note a death there. -EDOM, -ESTALE. */
 int fw_alive_at(const fw_db *db, uint32_t component, uint64_t cycle);
 /* Says how a component is, in its health object. Shared stores only; elsewhere it does nothing. */
 int fw_status(fw_db *db, uint32_t component, uint8_t state, const char *text);
@@ -262,7 +263,8 @@ int fw_check(const fw_db *db, fw_handle object, uint64_t w);
 /* -- waiting ---------------------------------------------------------------------------------------------------- */
 
 /* Waits until there is a write after `after`, at most until the store time is t_ns; returns the newest one.
- * -ETIMEDOUT; -EIDRM when it is deleted; -EHOSTDOWN when it is a stepped or barrier store without a clock. */
+ * -ETIMEDOUT; -EIDRM when it is deleted; -EHOSTDOWN when a stepped or barrier store is without a clock for 200 ms (a
+ * standby needs less). Whoever ticks the store waits by the host's time: store time stands meanwhile. */
 int64_t fw_wait_write(fw_db *db, fw_handle object, uint64_t after, int64_t t_ns);
 /* Waits, at most timeout_ns of the host's time, until the cycle is larger than `after`; returns the cycle. */
 int64_t fw_wait_cycle(fw_db *db, uint64_t after, int64_t timeout_ns);
@@ -281,7 +283,7 @@ int fw_clock_take(fw_db *db);
  * a dead clock left half done is finished first. */
 int64_t fw_tick(fw_db *db);
 /* Ticks a barrier or a real-time store until *stop is not 0. Takes the clock first, waiting for it as a standby while
- * another holds it. Tick 1 waits until each component in `wait_for` (n names) has joined and done cycle 0. Real time:
+ * another holds it. Tick 1 waits until each component in `wait_for` (n names) has joined. Real time:
  * absolute deadlines, so that no lateness adds up; a clock that is late by more than a tick leaves ticks out, and
  * counts them. Returns 0, or a negative errno value. */
 int fw_clock_run(fw_db *db, const char *const *wait_for, uint32_t n, const volatile int *stop);

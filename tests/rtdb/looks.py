@@ -1,7 +1,7 @@
 """A look at a store that is well, from which the tests make others."""
 
 from rtdb import ClockInfo, ComponentInfo, Flag, Kind
-from rtdb.look import ComponentLook, Look, ObjectLook
+from rtdb.db.look import ComponentLook, Look, ObjectLook
 
 S = 1_000_000_000
 CLOCK = ClockInfo(Kind.REAL, True, 77, 100, 0, 0, 0, (0,) * 20, 10_000_000)

@@ -37,9 +37,9 @@ from rtdb import (
     StoreMissing,
 )
 from rtdb.cli import app
+from rtdb.db.tail import Ended, writes
 from rtdb.json_object import json_schema
 from rtdb.records import enum8, f8, image, nested, seq
-from rtdb.tail import Ended, writes
 
 ROOT = Path(__file__).resolve().parents[2]
 ENV = os.environ | {"PYTHONPATH": str(ROOT)}

@@ -12,9 +12,9 @@ from conftest import Count, segment_path
 from looks import CLOCK, FIX, INFO, NOW
 
 from rtdb import Flag, Kind, Store
-from rtdb.doctor import examine, of_folder, of_segments, of_store, owes, span, state_of
-from rtdb.look import ComponentLook
-from rtdb.segments import bears_name, layout_of, remove, segments
+from rtdb.db.doctor import examine, of_folder, of_segments, of_store, owes, span, state_of
+from rtdb.db.look import ComponentLook
+from rtdb.db.segments import bears_name, layout_of, remove, segments
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from rtdb import Record, RecordError, Schema, schema_of
-from rtdb.edit import edited, packable
-from rtdb.json_object import json_schema
-from rtdb.records import array, enum8, f4, f8, flag, i8, i64, image, nested, seq, text, u8
-from rtdb.values import (
+from rtdb.db.edit import edited, packable
+from rtdb.db.values import (
     Part,
     did_you_mean,
     leaves,
@@ -22,6 +20,8 @@ from rtdb.values import (
     to_json,
     tokens_of_pointer,
 )
+from rtdb.json_object import json_schema
+from rtdb.records import array, enum8, f4, f8, flag, i8, i64, image, nested, seq, text, u8
 
 
 class Mode(IntEnum):

@@ -442,6 +442,17 @@ def test_an_old_cut_goes_on_saying_that_a_component_lived_when_it_has_left(kind,
         assert (lived.alive("w"), store.snapshot().alive("w")) == (True, False)
 
 
+def test_a_name_that_takes_the_place_of_another_has_not_its_past():
+    with Store.create(max_components=1) as store:
+        component = store.join("a")
+        lived = store.tick()
+        component.leave()
+        store.tick()
+        store.join("b")
+        store.tick()
+        assert (store.at_cycle(lived).alive("b"), store.snapshot().alive("b")) == (False, True)
+
+
 def test_a_life_that_changed_too_often_ages_out_and_is_not_made_up(store):
     lives = []
     for _ in range(20):

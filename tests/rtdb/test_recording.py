@@ -560,6 +560,36 @@ def test_a_recording_of_a_later_format_is_refused(path):
         Recording(path)
 
 
+def test_an_object_that_is_deleted_and_inserted_again_goes_on_in_its_topic(tmp_path):
+    with Store.create() as store, Recorder(tmp_path / "run.mcap", [store], {}) as recorder:
+        a = store.join("a")
+        for n in (1, 2):
+            writer = a.insert("n", Count)
+            writer.write(Count(n))
+            store.tick()
+            recorder.record()
+            writer.delete()
+    recording = Recording(tmp_path / "run.mcap")
+    assert [r.value.n for r in recording.read("a/n", Count)] == [1, 2]
+    assert list(recording.channels) == ["a/n"]
+
+
+def test_a_name_that_another_record_took_keeps_both(tmp_path):
+    with Store.create() as store, Recorder(tmp_path / "run.mcap", [store], {}) as recorder:
+        a = store.join("a")
+        a.insert("n", Count).write(Count(1))
+        store.tick()
+        recorder.record()
+        a.insert("n", Mixed).write(mixed(2))  # in place of the first
+        store.tick()
+        recorder.record()
+    recording = Recording(tmp_path / "run.mcap")
+    first, second = recording.channels
+    assert (first, second.split("@")[0]) == ("a/n", "a/n")
+    assert [r.value for r in recording.read(first, Count)] == [Count(1)]
+    assert [r.value for r in recording.read(second, Mixed)] == [mixed(2)]
+
+
 if __name__ == "__main__" and sys.argv[1:] == ["--write"]:
     OLDER.parent.mkdir(exist_ok=True)
     write_older(OLDER)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from looks import CLOCK, FIX, INFO, NOW, S
 
 from rtdb import Flag, Store
-from rtdb.look import ComponentLook, Look, look
-from rtdb.top import (
+from rtdb.db.look import ComponentLook, Look, look
+from rtdb.db.top import (
     clock_words,
     component_rows,
     end_of,

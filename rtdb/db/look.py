@@ -9,13 +9,13 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from .clock import ClockInfo
-from .components import ComponentInfo
-from .errors import Deleted, RtdbError
-from .objects import Flag, Object
+from ..clock import ClockInfo
+from ..components import ComponentInfo
+from ..errors import Deleted, RtdbError
+from ..objects import Flag, Object
 
 if TYPE_CHECKING:
-    from .store import Store
+    from ..store import Store
 
 COMMITS = 64  # so many of the newest writes of an object are looked at
 HEALTH = "Health"  # record of <component>/health, written by the core

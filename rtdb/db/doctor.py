@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .clock import Kind
-from .components import ComponentInfo
-from .errors import RtdbError
+from ..clock import Kind
+from ..components import ComponentInfo
+from ..errors import RtdbError
+from ..objects import Flag
 from .look import HEALTH, Look, look
-from .objects import Flag
 from .segments import FOLDER, Segment, segments
 
 if TYPE_CHECKING:
-    from .store import Store
+    from ..store import Store
 
 NEARLY_FULL = 0.9  # of a store's memory
 SCARCE_BYTES = 16 << 20  # of /dev/shm: a store takes all of its memory when it is created
@@ -211,7 +211,7 @@ def _is_there_first(module: str) -> bool:
 
 def examine(pattern: str, folder: Path) -> tuple[list[Segment], list[Finding]]:
     """Examine the segments whose stores fit a pattern, and a folder."""
-    from .store import Store
+    from ..store import Store
 
     found = segments(pattern)
     findings = list(of_segments(found))

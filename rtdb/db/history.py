@@ -3,15 +3,15 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from ..errors import AgedOut, Deleted, RecordError
+from ..records import Schema
 from .console import table
-from .errors import AgedOut, Deleted, RecordError
-from .records import Schema
 from .values import cell, leaves, part_of, text_of, tokens_of
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from .objects import Object, Sample
+    from ..objects import Object, Sample
 
 Path = tuple[str, ...]
 STAMPS = ("write", "t_commit_ns", "t_data_ns")

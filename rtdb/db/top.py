@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from .clock import ClockInfo, Kind
+from ..clock import ClockInfo, Kind
 from .console import table
 from .look import HEALTH, ComponentLook, Look, ObjectLook, look
 from .segments import bears_name, holders, segment_path
@@ -14,7 +14,7 @@ from .segments import bears_name, holders, segment_path
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from .store import Store
+    from ..store import Store
 
 _KINDS = {Kind.STEPPED: "stepped", Kind.BARRIER: "barrier", Kind.REAL: "real-time"}
 

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
-from .errors import RecordError
-from .json_object import JsonSchema, loads
-from .layout import KINDS, Field
-from .records import Schema
+from ..errors import RecordError
+from ..json_object import JsonSchema, loads
+from ..layout import KINDS, Field
+from ..records import Schema
 from .values import did_you_mean, part_of, text_of, tokens_of
 
 

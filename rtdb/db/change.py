@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from .objects import Object
-    from .store import Store
+    from ..objects import Object
+    from ..store import Store
 
 HEALTHY, FINDINGS, BROKEN = 0, 1, 3
 LOOK_S, GIVE_UP = 0.2, 25  # a clock looks that often whether it still is one; nobody was so many times: it is broken
@@ -52,8 +52,8 @@ def set_(
 
     For objects that everybody may write, and for those whose component is gone: it is taken for the moment.
     """
+    from ..errors import RecordError
     from .edit import edited, packable
-    from .errors import RecordError
     from .visit import find, visit
 
     with visit(db) as store:
@@ -73,8 +73,8 @@ def set_(
 
 def _check_may_change(store: "Store", obj: "Object[Any]", verb: str) -> None:
     """Refuse what only the owner may do, while it lives."""
-    from .errors import NotOwner
-    from .objects import Flag
+    from ..errors import NotOwner
+    from ..objects import Flag
     from .visit import owner_of
 
     owner = owner_of(store, obj.component)
@@ -88,7 +88,7 @@ def _check_may_change(store: "Store", obj: "Object[Any]", verb: str) -> None:
 @contextmanager
 def _in_place_of_its_owner(store: "Store", obj: "Object[Any]") -> Iterator[None]:
     """Be the component of an object for a moment, if it is gone and only it may write; it stays what it was."""
-    from .objects import Flag
+    from ..objects import Flag
     from .visit import owner_of
 
     if obj.flags & Flag.PUBLIC_WRITE:
@@ -121,7 +121,7 @@ def rm(name: Name, db: Db = "cart", yes: Annotated[bool, typer.Option("--yes", h
 
 def _with_children(store: "Store", obj: "Object[Any]") -> "list[Object[Any]]":
     """List an object and all that are deleted with it."""
-    from .objects import Flag
+    from ..objects import Flag
 
     below = [child for child in store.objects(parent=obj) if child.flags & Flag.WITH_PARENT]
     return [obj, *(gone for child in below for gone in _with_children(store, child))]
@@ -171,9 +171,9 @@ def clock(
     ] = False,
 ) -> None:
     """Tick a barrier or real-time store until Ctrl-C is pressed; beside a living clock, be its standby."""
-    from .clock import Kind
-    from .errors import NotOwner
-    from .realtime import realtime as ask
+    from ..clock import Kind
+    from ..errors import NotOwner
+    from ..realtime import realtime as ask
     from .visit import visit
 
     with visit(name) as store:

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .errors import RecordError
-from .json_object import JsonSchema, unit_of_key
-from .layout import Field
-from .records import Schema
+from ..errors import RecordError
+from ..json_object import JsonSchema, unit_of_key
+from ..layout import Field
+from ..records import Schema
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from .errors import AgedOut, ClockDead, Deleted
+from ..errors import AgedOut, ClockDead, Deleted
 from .top import end_of
 
 if TYPE_CHECKING:
-    from .objects import Object, Sample
-    from .store import Store
+    from ..objects import Object, Sample
+    from ..store import Store
 
 LOOK_S = 1.0  # how often we look whether the store is still there, while nothing comes
 

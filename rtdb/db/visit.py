@@ -4,19 +4,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from .errors import Deleted, ObjectMissing, StoreMissing
+from ..errors import Deleted, ObjectMissing, StoreMissing
 from .values import did_you_mean
 
 if TYPE_CHECKING:
-    from .components import ComponentInfo
-    from .objects import Object
-    from .store import Store
+    from ..components import ComponentInfo
+    from ..objects import Object
+    from ..store import Store
 
 
 @contextmanager
 def visit(db: str) -> "Iterator[Store]":
     """Attach to a store, and let go of it in the end."""
-    from .store import Store
+    from ..store import Store
 
     try:
         store = Store.attach(db)
