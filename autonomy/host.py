@@ -1,23 +1,36 @@
 """Hosts: run modules on a store, and keep their faults to themselves.
 
 Each due tick: inputs from the cut, the step, outputs checked and committed with inherited data time and lineage. A
-module that raises, gives NaN, assigns something else than its outputs or forgets one is stopped for good (the fault
-latches). Its outputs are held for HOLD_STEPS, then the host writes their safe values.
+module that raises, gives NaN or a value out of range, assigns something else than its outputs, forgets one, or does
+not end is stopped for good (the fault latches). Its outputs are held for HOLD_STEPS, then the host writes their safe
+values.
+
+Objects of a component: its outputs; `status`; `config` (its wiring, writable by anybody: the host takes a new one at
+the next due tick or says what is wrong with it); `show` (what the module shows); `timing`, where a budget is declared.
 """
 
 import logging
-import math
+import sys
+import time
 import traceback
 import zlib
+from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hal.signals import ModuleState, ModuleStatus
-from rtdb import Component, Object, Record, RtdbError, Sample, Store, Writer, schema_of
+from hal.signals import ModuleState, ModuleStatus, ModuleTiming
+from rtdb import HOST_DEPENDENT, Component, Flag, Kind, Record, RtdbError, Sample, Store, Writer, schema_of
+from rtdb.json_object import json_schema
 
-from .module import InputPort, Module, ModuleError, OutputPort
-from .wiring import Wire, make_module
+from .contain import HANG_CPU_S, HANG_WALL_S, StepHung, Watch, capped
+from .loading import check_inputs, checked_params, inputs_of, make_module
+from .module import InputPort, Module, ModuleError, OutputPort, Ranges
+from .pointer import Link, Unusable, link
+from .ranges import sound, what_is_wrong
+from .shown import shown
+from .wiring import Wire, wire_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,7 +38,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 HOLD_STEPS = 2
 HISTORY_S = 2.0
-OWN_FILES = ("host.py", "module.py")  # their lines tell a student nothing
+CONFIG_BYTES, SHOW_BYTES = 2000, 2000
+OWN_FILES = Path(__file__).parent, ("host.py", "module.py")  # their lines tell a student nothing
+FOREVER_NS = 1 << 62
+watch = Watch()
 
 
 def seeded(seed: int, name: str) -> "np.random.Generator":
@@ -35,34 +51,68 @@ def seeded(seed: int, name: str) -> "np.random.Generator":
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
 
 
+class Result:
+    """What a step gave: payloads of the outputs, what they were computed from, and the cycle in which to commit it."""
+
+    __slots__ = ("causes", "cycle", "payloads", "t_data_ns")
+
+    def __init__(self, cycle: int, payloads: list[bytes], t_data_ns: int, causes: tuple[tuple[int, int], ...]) -> None:
+        self.cycle, self.payloads, self.t_data_ns, self.causes = cycle, payloads, t_data_ns, causes
+
+
 class Host:
     """Runs one module. Make all hosts of a run, then `connect` them, then `step` them at every tick."""
 
-    def __init__(self, store: Store, wire: Wire, seed: int, *, participant: bool = False) -> None:
-        self.wire = wire
+    def __init__(
+        self, store: Store, wire: Wire, seed: int, *, participant: bool = False, faults: Path | None = None
+    ) -> None:
+        self.wire, self.seed, self._faults = wire, seed, faults
         self.module: Module = make_module(wire)
-        self.component: Component = store.join(wire.component, participant=participant)
-        self._store = store
-        edge: dict[str, Any] = {"every": wire.every, "phase": (wire.phase + 1) % wire.every, "history_s": HISTORY_S}
         cls = type(self.module)
+        self.component: Component = store.join(
+            wire.component, participant=participant, every=wire.every, phase=wire.phase
+        )
+        self._store, self._real = store, participant and store.clock.kind is Kind.REAL
+        edge: dict[str, Any] = {"every": wire.every, "history_s": HISTORY_S}
+        edge["phase"] = (wire.phase + 1 + wire.latency_cycles) % wire.every
         self._outputs: list[tuple[str, OutputPort[Any], Writer[Any], Callable[[Any], bool]]] = [
-            (
-                name,
-                port,
-                self.component.insert(name, port.cls, n_causes=min(8, len(cls.inputs)), **edge),
-                finite(port.cls),
-            )
+            (name, port, self._insert(name, port, edge), sound(port.cls, port.ranges))
             for name, port in cls.outputs.items()
         ]
+        edge["phase"] = (wire.phase + 1) % wire.every
         self._status = self.component.insert("status", ModuleStatus, **edge)
-        self._inputs: list[tuple[str, InputPort[Any], Object[Any] | None, int]] = []
+        few: dict[str, Any] = {"history_s": 0.1}
+        self._show: Writer[Any] = self.component.insert("show", json_schema(SHOW_BYTES), **(edge | few))
+        self._config: Writer[Any] = self.component.insert(
+            "config", json_schema(CONFIG_BYTES), flags=Flag.PUBLIC_WRITE, **few
+        )
+        self._configured = self._config.write(wire.entry(), store.now_ns)
+        self._timing = (
+            self.component.insert("timing", ModuleTiming, flags=HOST_DEPENDENT, **edge)
+            if wire.budget_ms is not None
+            else None
+        )
+        self._took = ModuleTiming()
+        self._budget_s = wire.budget_ms * 1e-3 if wire.budget_ms is not None else None
+        self._hang_s = HANG_CPU_S if self._budget_s is None else max(1.0, 20.0 * self._budget_s)
+        self._deadline_ns = int(wire.budget_ms * 1e6) if wire.budget_ms is not None else wire.every * store.tick_ns
+        self._inputs: list[tuple[str, InputPort[Any], Link | None, int]] = []
         self._state, self._reason = ModuleState.WAITING, ""
         self._steps = self._missed = 0
         self.module.rng = seeded(seed, wire.component)
         self.module.dt_s = wire.every * store.tick_ns * 1e-9
-        self._last: dict[str, Sample[Any]] = {}
+        self._last: dict[str, tuple[int, Any]] = {}  # write number and value of each input
+        self._pending: deque[Result] = deque()
         self._started = False
+        self._streams = capped(wire.component)
         self._status.write(ModuleStatus())
+
+    def _insert(self, name: str, port: OutputPort[Any], edge: dict[str, Any]) -> Writer[Any]:
+        """Insert an output; its schema tells readers the range that this module keeps to."""
+        schema = narrowed(port.cls, port.ranges) if port.ranges else port.cls
+        n_causes = min(8, len(type(self.module).inputs))
+        self.component.insert(name, schema, n_causes=n_causes, **edge)
+        return self._store.writer(f"{self.wire.component}/{name}", port.cls)
 
     @property
     def fault(self) -> str:
@@ -71,135 +121,283 @@ class Host:
 
     def connect(self, timeout_s: float = 0.0) -> None:
         """Find the objects that the inputs point at."""
+        self._inputs = self._links(self.wire, timeout_s)
+
+    def _links(self, wire: Wire, timeout_s: float) -> list[tuple[str, InputPort[Any], Link | None, int]]:
+        out: list[tuple[str, InputPort[Any], Link | None, int]] = []
+        pointers = inputs_of(type(self.module), wire.inputs)
         for name, port in type(self.module).inputs.items():
-            pointer, found = self.wire.inputs.get(name), None
+            pointer, found = pointers.get(name), None
             if pointer is not None:
                 try:
-                    found = self._store.find(pointer, port.cls, timeout_s=0.0 if port.optional else timeout_s)
-                except RtdbError as error:
-                    if not port.optional:
-                        raise ModuleError(f"{self.wire.component}.{name} = {pointer}: {error}") from error
-            max_age_ns = int(port.max_age_s * 1e9) if port.max_age_s is not None else 1 << 62
-            self._inputs.append((name, port, found, max_age_ns))
+                    found = link(self._store, pointer, port, 0.0 if port.optional else timeout_s)
+                except (RtdbError, ModuleError) as error:
+                    if not (port.optional and isinstance(error, KeyError)):  # nobody need provide what is optional
+                        raise ModuleError(f"{wire.component}.{name} = {pointer}: {error}") from error
+            out.append((name, port, found, int(port.max_age_s * 1e9) if port.max_age_s is not None else FOREVER_NS))
+        return out
+
+    # -- one cycle --------------------------------------------------------------------------------------------------
 
     def step(self, cycle: int, _t_ns: int = 0) -> None:
         """Run the module if it is due in this cycle."""
-        if cycle % self.wire.every != self.wire.phase:
-            return
-        now_ns = self._store.core.now_ns
+        if self._pending and self._pending[0].cycle <= cycle:
+            self._commit(self._pending.popleft())
+        if cycle % self.wire.every == self.wire.phase and self.begin(cycle):
+            self.finish()
+
+    def begin(self, cycle: int) -> bool:
+        """Put the inputs of a due cycle into the module; False if it cannot be called in this cycle."""
+        self._cycle = cycle
+        now_ns = self._now_ns = self._store.core.now_ns
         if self._state is ModuleState.FAULT:
             self._miss(now_ns)
-            return
+            return False
+        if self._store.core.visible_write(self._config.handle, cycle) > self._configured:
+            self._rewire(cycle)
         absent = self._read(cycle, now_ns)
         if absent:
             self._say(ModuleState.STALE if self._steps else ModuleState.WAITING, absent)
             self._miss(now_ns)
+            return False
+        module = self.module
+        module.t_ns = self._store.t0_ns + cycle * self._store.tick_ns
+        if not self._started:
+            self._started = True
+            return self._guarded(module.reset)
+        return True
+
+    def finish(self) -> None:
+        """Call the step, and commit what it gave."""
+        module = self.module
+        before = dict(module.__dict__) if self._faults is not None else {}
+        names = len(module.__dict__)
+        module._out.clear()
+        begun_s = time.perf_counter() if self._timing is not None else 0.0
+        if not self._guarded(module.step, before):
             return
+        if self._timing is not None:
+            self._note_time(time.perf_counter() - begun_s)
+        late_ns = self._store.core.now_ns - module.t_ns - self._deadline_ns if self._real else 0
         try:
-            payloads = self._call(now_ns)
-        except (Exception, SystemExit) as error:  # a module may raise anything; it must not harm others
-            log.warning("%s stopped at cycle %d: %s: %s", self.wire.component, cycle, type(error).__name__, error)
-            log.debug("traceback", exc_info=True)
-            self._say(ModuleState.FAULT, f"cycle {cycle}: {type(error).__name__}: {error}{_where(error)}")
-            self._miss(now_ns)
+            if len(module.__dict__) != names:
+                self._check_names()
+            payloads = self._payloads()
+        except Exception as error:  # a value may be anything
+            self._fail(error, before)
             return
         self._steps += 1
+        if module._shown:
+            self._write_shown()
+        if late_ns > 0:
+            self._say(ModuleState.LATE, f"cycle {self._cycle}: {late_ns * 1e-6:.1f} ms late, its result is dropped")
+            self._miss(self._now_ns)
+            return
         self._missed = 0
-        self._commit(payloads, now_ns)
+        result = self._result(payloads)
+        if self.wire.latency_cycles:
+            self._pending.append(result)
+        else:
+            self._commit(result)
         self._say(ModuleState.RUNNING, "")
+
+    def _guarded(self, call: Callable[[], None], before: dict[str, Any] | None = None) -> bool:
+        """Call the module; False if that went wrong. Its prints are capped, and an endless loop is ended."""
+        streams = sys.stdout, sys.stderr
+        sys.stdout, sys.stderr = self._streams
+        try:
+            watch.begin(self._hang_s)
+            try:
+                call()
+            finally:
+                watch.end()
+        except (Exception, SystemExit, StepHung) as error:  # a module may raise anything; it must not harm others
+            sys.stdout, sys.stderr = streams
+            self._fail(error, before or {})
+            return False
+        finally:
+            sys.stdout, sys.stderr = streams
+        return True
 
     def _read(self, cycle: int, now_ns: int) -> str:
         """Put the inputs of this cut into the module; returns what is absent, empty if nothing is."""
         module, values, last = self.module, self.module.__dict__, self._last
-        module.samples.clear()
+        samples = module.samples
+        before = dict(samples)
+        samples.clear()
         for name, port, found, max_age_ns in self._inputs:
-            sample = found.visible_since(cycle, last.get(name)) if found is not None else None
-            if sample is not None and now_ns - sample.t_data_ns <= max_age_ns:
-                module.samples[name] = last[name] = sample
-                values[name] = sample.value
-            elif port.optional:
-                values[name] = None
-            elif sample is None:
-                return f"input {name} ({self.wire.inputs[name]}) is not there yet"
-            else:
-                return (
-                    f"input {name} ({self.wire.inputs[name]}) is {(now_ns - sample.t_data_ns) * 1e-9:.2f} s old, "
-                    f"at most {port.max_age_s} s"
-                )
+            sample: Sample[Any] | None = None
+            if found is not None:
+                sample = found.obj.visible_since(cycle, before.get(name))
+            why = ""
+            if sample is None:
+                why = "is not there yet"
+            elif found is not None:
+                age_ns = now_ns - (sample.t_commit_ns if found.json else sample.t_data_ns)
+                if age_ns > max_age_ns:
+                    why = f"is {age_ns * 1e-9:.2f} s old, at most {port.max_age_s} s"
+                elif found.value is None:
+                    samples[name] = sample
+                    values[name] = sample.value
+                    continue
+                else:
+                    known = last.get(name)
+                    try:
+                        if known is None or known[0] != sample.write:
+                            last[name] = known = (sample.write, found.value(sample))
+                        samples[name] = sample
+                        values[name] = known[1]
+                        continue
+                    except Unusable as error:
+                        why = f"cannot be used: {error}"
+            if not port.optional:
+                return f"input {name} ({inputs_of(type(module), self.wire.inputs)[name]}) {why}"
+            values[name] = None
         return ""
 
-    def _call(self, now_ns: int) -> list[bytes]:
-        """Call the step; returns the payload of each output, or raises what is wrong."""
+    def _check_names(self) -> None:
+        """Refuse a record under a name that is no port: an output with a spelling mistake."""
         module = self.module
-        module.t_ns = now_ns
-        if not self._started:
-            module.reset()
-            self._started = True
-        names = len(module.__dict__)
-        module._out.clear()
-        module.step()
-        if len(module.__dict__) != names:
-            for name, value in module.__dict__.items():
-                if isinstance(value, Record) and name not in module.inputs and not name.startswith("_"):
-                    raise ModuleError(
-                        f"self.{name} is not an output; {type(module).__name__} declares "
-                        f"{', '.join(module.outputs)} (start names of your own records with _)"
-                    )
-        payloads = []
-        for name, port, writer, is_finite in self._outputs:
+        for name, value in module.__dict__.items():
+            if isinstance(value, Record) and name not in module.inputs and not name.startswith("_"):
+                raise ModuleError(
+                    f"self.{name} is not an output; {type(module).__name__} declares "
+                    f"{', '.join(module.outputs)} (start names of your own records with _)"
+                )
+
+    def _payloads(self) -> list[bytes]:
+        """Give the payload of each output, or raise what is wrong with them."""
+        module, payloads = self.module, []
+        for name, port, writer, is_sound in self._outputs:
             value = module._out.get(port)
             if value is None:
                 raise ModuleError(f"output {name} was not assigned in this step")
             if type(value) is not port.cls:
                 raise ModuleError(f"output {name} is a {port.cls.__name__}, got {value!r:.60}")
-            if not is_finite(value):
-                raise ModuleError(f"output {name} is not finite: {value!r:.100}")
+            if not is_sound(value):
+                raise ModuleError(f"output {name} {what_is_wrong(value, port.ranges)}")
             payloads.append(writer.schema.pack(value))
         return payloads
 
-    def _commit(self, payloads: list[bytes], now_ns: int) -> None:
-        t_data_ns, causes = now_ns, []
+    def _result(self, payloads: list[bytes]) -> Result:
+        t_data_ns, causes = self._now_ns, []
         for name, port, found, _ in self._inputs:
-            sample: Sample[Any] | None = self.module.samples.get(name)
+            sample = self.module.samples.get(name)
             if sample is None or port.static or found is None:
                 continue
-            causes.append((found.oid, sample.write))
+            causes.append((found.obj.oid, sample.write))
             t_data_ns = min(t_data_ns, sample.t_data_ns)
-        lineage = tuple(causes[:8])
+        return Result(self._cycle + self.wire.latency_cycles, payloads, t_data_ns, tuple(causes[:8]))
+
+    def _commit(self, result: Result) -> None:
         core = self._store.core
-        for (_, _, writer, _), payload in zip(self._outputs, payloads, strict=True):
-            core.write(writer.handle, payload, core.not_before(writer.handle, t_data_ns), lineage)
+        for (_, _, writer, _), payload in zip(self._outputs, result.payloads, strict=True):
+            core.write(writer.handle, payload, core.not_before(writer.handle, result.t_data_ns), result.causes)
+
+    # -- what goes wrong --------------------------------------------------------------------------------------------
+
+    def _fail(self, error: BaseException, before: dict[str, Any]) -> None:
+        """Stop the module for good."""
+        reason = (
+            f"the step did not end within {self._hang_s:g} s of CPU time, or {HANG_WALL_S:g} s"
+            if isinstance(error, StepHung)
+            else str(error)
+        )
+        name, cycle = self.wire.component, self._cycle
+        log.warning("%s stopped at cycle %d: %s: %s", name, cycle, type(error).__name__, reason)
+        log.debug("traceback", exc_info=error)
+        if self._faults is not None:
+            from .repro import save
+
+            file = save(self._faults, self, before, error)
+            log.warning("fairway repro %s runs just this step again", file)
+        self._say(ModuleState.FAULT, f"cycle {cycle}: {type(error).__name__}: {reason}{_where(error)}")
+        if isinstance(error, MemoryError):
+            self.module.__dict__.clear()  # what it has gathered
+        self._pending.clear()
+        self._miss(self._now_ns)
 
     def _miss(self, now_ns: int) -> None:
         """Hold the outputs for a while, then write the safe ones."""
-        if not self._started:
+        if not self._outputs or not self._outputs[0][2].head:
             return  # nothing was ever said: there is nothing to take back
         self._missed += 1
         if self._missed > HOLD_STEPS:
+            core = self._store.core
             for _, port, writer, _ in self._outputs:
-                writer.write(port.safe, now_ns)
+                writer.write(port.safe, core.not_before(writer.handle, now_ns))
+
+    def _rewire(self, cycle: int) -> None:
+        """Take the wiring that somebody wrote, or stay with the present one and say why."""
+        self._configured = self._store.core.visible_write(self._config.handle, cycle)
+        name = self.wire.component
+        try:
+            sample = self._config.visible(cycle)
+            wire = wire_of(name, name, sample.value if sample is not None else None)
+            fixed = ("module", "every", "phase", "latency_cycles", "budget_ms", "memory_mb")
+            for key in fixed:
+                if getattr(wire, key) != getattr(self.wire, key):
+                    raise ModuleError(
+                        f"{name}: {key} stays as it is while the system runs; inputs and params may change"
+                    )
+            cls = type(self.module)
+            check_inputs(name, cls, wire.inputs)
+            params = checked_params(name, cls, wire.params)
+            links = self._links(wire, 0.0)
+        except (ModuleError, RtdbError) as error:
+            log.warning("%s keeps its wiring: %s", name, error)
+            self._status.write(self._told(f"wiring refused: {error}"))
+            return
+        self.wire, self._inputs = wire, links
+        self.module.samples.clear()
+        self._last.clear()
+        for port in cls.params:
+            self.module.__dict__.pop(port, None)
+        self.module.__dict__.update(params)
+        self._status.write(self._told(f"wired anew in cycle {cycle}"))
+
+    # -- what it says -----------------------------------------------------------------------------------------------
 
     def _say(self, state: ModuleState, reason: str) -> None:
         if (state, reason) != (self._state, self._reason) and not (state is self._state is ModuleState.STALE):
             self._state, self._reason = state, reason
-            cut = reason.encode()[:160].decode(errors="ignore").replace("\0", "")
-            self._status.write(ModuleStatus(state=state, steps=self._steps, reason=cut))
+            self._status.write(self._told(reason))
+
+    def _told(self, reason: str) -> ModuleStatus:
+        cut = reason.encode()[:160].decode(errors="ignore").replace("\0", "")
+        return ModuleStatus(state=self._state, steps=self._steps, reason=cut)
+
+    def _write_shown(self) -> None:
+        document = shown(self.module._shown, SHOW_BYTES)
+        self.module._shown.clear()
+        self._show.write(document, self._now_ns)
+
+    def _note_time(self, took_s: float) -> None:
+        assert self._timing is not None
+        assert self._budget_s is not None
+        over = self._took.over_budget + (took_s > self._budget_s)
+        self._took = ModuleTiming(self._took.steps + 1, took_s, max(self._took.longest_s, took_s), over)
+        self._timing.write(self._took, self._now_ns)
+
+
+def narrowed(cls: type[Record], ranges: Ranges) -> Any:
+    """Give a record's schema with the ranges of a port: for readers, who find them in the store."""
+    from rtdb import Schema
+
+    wide = schema_of(cls)
+    fields = [
+        replace(f, spec=replace(f.spec, low=float(ranges[f.name][0]), high=float(ranges[f.name][1])))
+        if f.name in ranges
+        else f
+        for f in wide.fields
+    ]
+    return Schema(wide.name, wide.doc, fields, cls)
 
 
 def _where(error: BaseException) -> str:
     """Name file and line of the innermost frame that is not ours: where a student looks first."""
     at = ""
     for frame in traceback.extract_tb(error.__traceback__):
-        if Path(frame.filename).parent != Path(__file__).parent or Path(frame.filename).name not in OWN_FILES:
+        if Path(frame.filename).parent != OWN_FILES[0] or Path(frame.filename).name not in OWN_FILES[1]:
             at = f" ({Path(frame.filename).name}:{frame.lineno})"
     return at
-
-
-def finite(cls: type[Record]) -> Callable[[Any], bool]:
-    """Make a test of whether all floats of a record are finite: their sum is, exactly if each of them is."""
-    terms = [
-        f"sum(r.{f.name})" if f.spec.shape != "one" else f"r.{f.name}"
-        for f in schema_of(cls).fields
-        if f.spec.kind in ("f8", "f4")
-    ]
-    return eval(f"lambda r: isfinite({' + '.join(terms) or '0.0'})", {"isfinite": math.isfinite, "sum": sum})  # type: ignore[no-any-return]

@@ -9,37 +9,35 @@ import random
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from rtdb import RtdbError, Store
 
+from .contain import limit_memory
 from .host import Host
 from .module import ModuleError
-from .wiring import Wire
+from .wiring import Wire, wire_of
 
 CONNECT_S = 30.0
+MEMORY_MB = 4096  # of a module that does not say
 MAX_DELAY_S = 0.0005  # of a shuffled run
 
 
 def spawn(
-    store_name: str, wires: tuple[Wire, ...], seed: int, delay_seed: int | None = None
+    store_name: str,
+    wires: tuple[Wire, ...],
+    seed: int,
+    delay_seed: int | None = None,
+    faults: Path | None = None,
 ) -> "subprocess.Popen[str]":
     """Start a process for some modules of a stack. It ends by itself when the store is closed."""
     job = {
         "store": store_name,
         "seed": seed,
         "delay_seed": delay_seed,
-        "wires": [
-            {
-                "component": w.component,
-                "module": w.module,
-                "every": w.every,
-                "phase": w.phase,
-                "inputs": w.inputs,
-                "params": w.params,
-            }
-            for w in wires
-        ],
+        "faults": str(faults) if faults is not None else None,
+        "wires": {wire.component: wire.entry() for wire in wires},
     }
     child = subprocess.Popen([sys.executable, "-m", "autonomy.process"], stdin=subprocess.PIPE, text=True)
     assert child.stdin is not None
@@ -52,7 +50,10 @@ def run(job: dict[str, Any]) -> None:
     """Host the modules of a job until the clock stops for good."""
     with Store.attach(job["store"]) as store:
         cycle = store.cycle  # before the clock can see us: no cycle that it waits for is left out
-        hosts = [Host(store, Wire(**wire), job["seed"], participant=True) for wire in job["wires"]]
+        wires = [wire_of(name, name, entry) for name, entry in job["wires"].items()]
+        limit_memory(sum(wire.memory_mb or MEMORY_MB for wire in wires))
+        faults = Path(job["faults"]) if job.get("faults") else None
+        hosts = [Host(store, wire, job["seed"], participant=True, faults=faults) for wire in wires]
         for host in hosts:
             host.connect(CONNECT_S)
         delays = random.Random(job["delay_seed"]) if job.get("delay_seed") is not None else None

@@ -5,25 +5,34 @@ A stack is a JSON file, one entry per component:
     {"follow": {"module": "autonomy.follow:Follow", "every": 4, "phase": 2,
                 "inputs": {"pose": "localise/pose"}, "params": {"lookahead_m": 3.0}}}
 
-The entry "actuators" has no module: it names the command that the HAL obeys.
+The entry "actuators" has no module: it names the command that the HAL obeys. Each entry also stands in the store, as
+the JSON object `<component>/config`; writing it there rewires a running system.
 """
 
-import importlib
-import importlib.util
 import json
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from .module import Module, ModuleError
+from .loading import inputs_of, load_module, make_module
+from .module import ModuleError
+from .pointer import split
 
 ACTUATORS = "actuators"
+MAX_LATENCY_CYCLES = 100
+KEYS = ("module", "every", "phase", "inputs", "params", "latency_cycles", "budget_ms", "memory_mb")
 
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """Wiring of one component. Due at ticks c with c % every == phase; its outputs show at the tick after."""
+    """Wiring of one component. Due at ticks c with c % every == phase; its outputs show at the tick after.
+
+    latency_cycles: so many ticks later, as if the step took that long. budget_ms: what a step may take; in real time a
+    later result is dropped [until it is due again], in simulation it is only counted. memory_mb: of a process of its
+    own.
+    """
 
     component: str
     module: str
@@ -31,6 +40,18 @@ class Wire:
     phase: int
     inputs: dict[str, str]
     params: dict[str, Any] = field(default_factory=dict)
+    latency_cycles: int = 0
+    budget_ms: float | None = None
+    memory_mb: int | None = None
+
+    def entry(self) -> dict[str, Any]:
+        """Give the entry of a stack file that says the same."""
+        said = {key: getattr(self, key) for key in KEYS}
+        return {key: value for key, value in said.items() if key in KEYS[:4] or value not in ({}, None, 0)}
+
+    def objects(self) -> dict[str, str]:
+        """Give the name of the object behind each wired input."""
+        return {name: split(pointer)[0] for name, pointer in inputs_of(load_module(self.module), self.inputs).items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,94 +88,87 @@ def load_stack(path: Path) -> Stack:
     command = pointers.get("drive") if isinstance(pointers, dict) else None
     if not isinstance(command, str):
         raise ModuleError(f'{path}: {ACTUATORS}: expected {{"inputs": {{"drive": "component/object"}}}}')
-    return Stack(tuple(_wire(path, name, entry) for name, entry in raw.items() if name != ACTUATORS), command)
+    return Stack(tuple(wire_of(f"{path}: {name}", name, raw[name]) for name in raw if name != ACTUATORS), command)
 
 
-def _wire(path: Path, name: str, entry: Any) -> Wire:
+def stack_with(path: Path, uses: Sequence[str]) -> Stack:
+    """Read a stack file, swap modules (COMPONENT=FILE.py:Class), and refuse what cannot run: before anything starts."""
+    stack = load_stack(path)
+    for use in uses:
+        component, separator, module = use.partition("=")
+        if not separator:
+            raise ModuleError(f"--use {use}: expected COMPONENT=FILE.py:Class")
+        stack = stack.use(component, module)
+    for wire in stack.wires:
+        make_module(wire)
+    check_stack(stack)
+    return stack
+
+
+def wire_of(where: str, component: str, entry: Any) -> Wire:
+    """Read the wiring of one component; ModuleError says where and what is wrong."""
     if not isinstance(entry, dict):
-        raise ModuleError(
-            f"{path}: {name}: an entry is an object with module, every, phase and inputs, got {entry!r:.60}"
-        )
-    unknown = set(entry) - {"module", "every", "phase", "inputs", "params"}
+        raise ModuleError(f"{where}: an entry is an object with module, every, phase and inputs, got {entry!r:.60}")
+    unknown = set(entry) - set(KEYS)
     if unknown:
-        raise ModuleError(
-            f"{path}: {name}: unknown key {', '.join(sorted(unknown))}; "
-            "an entry has module, every, phase, inputs and params"
-        )
-    try:
-        wire = Wire(name, entry["module"], entry["every"], entry["phase"], entry["inputs"], entry.get("params", {}))
-    except KeyError as error:
-        raise ModuleError(f"{path}: {name}: the key {error} is missing") from error
+        raise ModuleError(f"{where}: unknown key {', '.join(sorted(unknown))}; an entry has {', '.join(KEYS)}")
+    missing = [key for key in KEYS[:4] if key not in entry]
+    if missing:
+        raise ModuleError(f"{where}: the key {missing[0]!r} is missing")
+    wire = Wire(component, **entry)
     if not isinstance(wire.module, str):
-        raise ModuleError(f"{path}: {name}: module is package.module:Class or FILE.py:Class, got {wire.module!r:.60}")
+        raise ModuleError(f"{where}: module is package.module:Class or FILE.py:Class, got {wire.module!r:.60}")
     if not (isinstance(wire.inputs, dict) and all(isinstance(pointer, str) for pointer in wire.inputs.values())):
-        raise ModuleError(f'{path}: {name}: inputs are {{"input": "component/object"}}, got {wire.inputs!r:.60}')
+        raise ModuleError(f'{where}: inputs are {{"input": "component/object"}}, got {wire.inputs!r:.60}')
     if not isinstance(wire.params, dict):
-        raise ModuleError(f'{path}: {name}: params are {{"parameter": value}}, got {wire.params!r:.60}')
+        raise ModuleError(f'{where}: params are {{"parameter": value}}, got {wire.params!r:.60}')
     if not (type(wire.every) is type(wire.phase) is int and 0 <= wire.phase < wire.every):
         raise ModuleError(
-            f"{path}: {name}: every and phase are whole ticks with 0 <= phase < every, "
+            f"{where}: every and phase are whole ticks with 0 <= phase < every, "
             f"got every={wire.every!r} phase={wire.phase!r}"
         )
+    if type(wire.latency_cycles) is not int or not 0 <= wire.latency_cycles <= MAX_LATENCY_CYCLES:
+        raise ModuleError(f"{where}: latency_cycles is 0 to {MAX_LATENCY_CYCLES} ticks, got {wire.latency_cycles!r}")
+    for key, value in (("budget_ms", wire.budget_ms), ("memory_mb", wire.memory_mb)):
+        if value is not None and not (type(value) in (int, float) and value > 0):
+            raise ModuleError(f"{where}: {key} is a number above 0, got {value!r}")
     return wire
 
 
-def load_module(spec: str) -> type[Module]:
-    """Load `package.module:Class` or `file.py:Class`."""
-    place, _, name = spec.rpartition(":")
-    if not place:
-        raise ModuleError(f"{spec!r}: name a module as FILE.py:Class or package.module:Class")
-    try:
-        loaded = _from_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
-    except ModuleError:
-        raise
-    except (Exception, SystemExit) as error:  # a student's file may raise anything while it is imported
-        raise ModuleError(f"{spec}: {type(error).__name__} while loading it: {error}") from error
-    cls = getattr(loaded, name, None)
-    if not (isinstance(cls, type) and issubclass(cls, Module)) or cls is Module:
-        found = [
-            n for n, v in vars(loaded).items() if isinstance(v, type) and issubclass(v, Module) and v is not Module
-        ]
-        raise ModuleError(f"{spec}: {place} has no Module named {name}; it has {', '.join(found) or 'none'}")
-    return cls
+def check_stack(stack: Stack) -> None:
+    """Refuse a stack in which modules wait for each other: each needs an output of the next before it can begin."""
+    needs = {wire.component: needed(wire) for wire in stack.wires}
+    for start in needs:
+        path = _loop(start, needs, [start])
+        if path:
+            waits = ", ".join(f"{a} needs {b}" for a, b in pairwise(path))
+            raise ModuleError(f"{waits}: nobody can begin; make one of these inputs optional")
 
 
-def _from_file(path: Path) -> Any:
-    if not path.is_file():
-        raise ModuleError(f"no file {path}; --use takes COMPONENT=FILE.py:Class")
-    name = f"fairway_student_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ModuleError(f"{path} is not a Python file")
-    loaded = importlib.util.module_from_spec(spec)
-    sys.modules[name] = loaded
-    spec.loader.exec_module(loaded)
-    return loaded
+def _loop(start: str, needs: dict[str, list[str]], path: list[str]) -> list[str]:
+    for component in needs[path[-1]]:
+        if component == start:
+            return [*path, start]
+        if component in needs and component not in path:
+            found = _loop(start, needs, [*path, component])
+            if found:
+                return found
+    return []
 
 
-def make_module(wire: Wire) -> Module:
-    """Make a module with its parameters set and its wiring checked; ModuleError names what does not fit."""
-    cls = load_module(wire.module)
-    try:
-        module = cls()
-    except (Exception, SystemExit) as error:  # no step(), or an __init__ that raises
-        raise ModuleError(f"{wire.component}: {wire.module}: {type(error).__name__}: {error}") from error
-    for name, value in wire.params.items():
-        port = cls.params.get(name)
-        if port is None:
-            raise ModuleError(
-                f"{wire.component}: {cls.__name__} has no parameter {name}; it has {', '.join(cls.params) or 'none'}"
-            )
-        wanted = type(port.default)
-        if type(value) is not wanted and not (wanted is float and type(value) is int):
-            raise ModuleError(f"{wire.component}: parameter {name} is a {wanted.__name__} [{port.unit}], got {value!r}")
-        module.__dict__[name] = wanted(value)
-    for name in wire.inputs:
-        if name not in cls.inputs:
-            raise ModuleError(
-                f"{wire.component}: {cls.__name__} has no input {name}; it has {', '.join(cls.inputs) or 'none'}"
-            )
-    for name, input_port in cls.inputs.items():
-        if name not in wire.inputs and not input_port.optional:
-            raise ModuleError(f"{wire.component}: input {name} of {cls.__name__} is not wired")
-    return module
+def needed(wire: Wire) -> list[str]:
+    """Name the components without whose outputs a module is not called."""
+    ports = load_module(wire.module).inputs
+    return [name.partition("/")[0] for port, name in wire.objects().items() if not ports[port].optional]
+
+
+def required(stack: Stack) -> set[str]:
+    """Name the components without which the actuators get no command."""
+    wires = {wire.component: wire for wire in stack.wires}
+    found, ahead = set[str](), [split(stack.command)[0].partition("/")[0]]
+    while ahead:
+        component = ahead.pop()
+        if component in wires and component not in found:
+            found.add(component)
+            ahead += needed(wires[component])
+    return found

@@ -206,9 +206,9 @@ class ActuatorState(Record, frozen=True):
 class DriveCommand(Record, frozen=True):
     """How to drive: a speed to reach and a steering angle."""
 
-    speed_mps: Annotated[float, f8("m/s", "speed wanted, backward negative")] = 0.0
-    steer_rad: Annotated[float, f8("rad", "road-wheel angle wanted, left positive")] = 0.0
-    decel_mps2: Annotated[float, f8("m/s2", "largest deceleration to use when slowing down, at most 1.5")] = 1.5
+    speed_mps: Annotated[float, f8("m/s", "speed wanted, backward negative", low=-1.5, high=5.5)] = 0.0
+    steer_rad: Annotated[float, f8("rad", "road-wheel angle wanted, left positive", low=-0.47, high=0.47)] = 0.0
+    decel_mps2: Annotated[float, f8("m/s2", "largest deceleration to use when slowing down", low=0.0, high=1.5)] = 1.5
 
 
 STOP = DriveCommand()
@@ -294,6 +294,7 @@ class ModuleState(IntEnum):
     RUNNING = 1
     STALE = 2
     FAULT = 3
+    LATE = 4
 
 
 class ModuleStatus(Record, frozen=True):
@@ -301,7 +302,16 @@ class ModuleStatus(Record, frozen=True):
 
     state: Annotated[ModuleState, enum8("state of the module")] = ModuleState.WAITING
     steps: Annotated[int, u32("", "steps done when the state last changed")] = 0
-    reason: Annotated[str, text(160, "why it does not run")] = ""
+    reason: Annotated[str, text(160, "why it does not run, or what became of new wiring")] = ""
+
+
+class ModuleTiming(Record, frozen=True):
+    """What the steps of a module with a budget took on this machine. Not part of the trace."""
+
+    steps: Annotated[int, u32("", "steps timed")] = 0
+    last_s: Annotated[float, f8("s", "the last step")] = 0.0
+    longest_s: Annotated[float, f8("s", "the longest step")] = 0.0
+    over_budget: Annotated[int, u32("", "steps that took longer than the budget")] = 0
 
 
 # -- truth: only in the world store, which modules never see -----------------------------------------------------------

@@ -67,7 +67,10 @@ _SHAPES = ("one", "array", "seq")
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """What a field's annotation says. `n`: capacity; `shape`: "one", "array" (exactly n) or "seq" (up to n)."""
+    """What a field's annotation says. `n`: capacity; `shape`: "one", "array" (exactly n) or "seq" (up to n).
+
+    low, high: range of its values, ends included. The store keeps any value; who runs modules holds them to it.
+    """
 
     kind: str
     unit: str
@@ -75,6 +78,8 @@ class Spec:
     n: int = 1
     shape: str = "one"
     extent: Extent | None = None  # of the largest image
+    low: float = -math.inf
+    high: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,8 +189,16 @@ def _check(record: str, f: Field) -> None:
     if (f.inner is None) != (spec.kind != "record"):
         raise RecordError(f"{at}: a nested record, and only that, has fields of its own")
     (spec.unit + spec.doc).encode()  # raises for what is no text
+    _check_range(at, spec)
     _check_extent(at, spec)
     _check_values(at, f)
+
+
+def _check_range(at: str, spec: Spec) -> None:
+    if not (isinstance(spec.low, int | float) and isinstance(spec.high, int | float) and spec.low <= spec.high):
+        raise RecordError(f"{at}: a range from {spec.low!r} to {spec.high!r} holds nothing")
+    if (spec.low, spec.high) != (-math.inf, math.inf) and spec.kind in (*_ALONE, "bool", "record"):
+        raise RecordError(f"{at}: {spec.kind} has no range; numbers have")
 
 
 def _check_extent(at: str, spec: Spec) -> None:

@@ -3,6 +3,7 @@
     class Pose(Record):
         '''Pose of the cart in the map.'''
         x_m: Annotated[float, f8("m", "east of the map's origin")]
+        speed_mps: Annotated[float, f8("m/s", "forward", low=-2, high=8)] = 0.0     # no part of what must agree
         quality: Annotated[Quality, enum8("kind of fix")] = Quality.NONE
         at: Annotated[Point, nested("the front axle")] = Point()
         outline: Annotated[tuple[Point, ...], nested("corners, counter-clockwise", at_most=8)] = ()
@@ -23,12 +24,13 @@ and added.
 import functools
 import hashlib
 import json
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -83,8 +85,15 @@ class Record(msgspec.Struct, frozen=True, gc=False):
 # -- declarations -----------------------------------------------------------------------------------------------------
 
 
-def _scalar(kind: str) -> Callable[[str, str], Spec]:
-    return lambda unit, doc: Spec(kind, unit, doc)
+class _Scalar(Protocol):
+    def __call__(self, unit: str, doc: str, *, low: float = ..., high: float = ...) -> Spec: ...
+
+
+def _scalar(kind: str) -> _Scalar:
+    def declare(unit: str, doc: str, *, low: float = -math.inf, high: float = math.inf) -> Spec:
+        return Spec(kind, unit, doc, low=low, high=high)
+
+    return declare
 
 
 f8, f4 = _scalar("f8"), _scalar("f4")
@@ -153,6 +162,7 @@ class Schema:
             said |= {"n": f.spec.n, "shape": f.spec.shape, "number": f.number, "values": dict(f.values)}
             if f.spec.extent:
                 said["extent"] = f.spec.extent
+            said |= {end: value for end in ("low", "high") if math.isfinite(value := getattr(f.spec, end))}
             if f.inner:
                 said["record"] = f.inner._described()
             fields.append(said)
@@ -250,7 +260,9 @@ def _schema_from(raw: dict[str, Any], depth: int) -> Schema:
         raise RecordError(f"more than {MAX_DEPTH} records in each other")
     fields = []
     for f in raw["fields"]:
-        spec = Spec(f["kind"], f["unit"], f["doc"], f["n"], f["shape"], tuple(f["extent"]) if "extent" in f else None)
+        extent = tuple(f["extent"]) if "extent" in f else None
+        low, high = f.get("low", -math.inf), f.get("high", math.inf)
+        spec = Spec(f["kind"], f["unit"], f["doc"], f["n"], f["shape"], extent, low, high)
         inner = _schema_from(f["record"], depth + 1) if "record" in f else None
         fields.append(Field(f["name"], spec, f["number"], values=tuple(f["values"].items()), inner=inner))
     made = JsonSchema if depth == 1 and is_json(fields) else Schema

@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from autonomy.wiring import stack_with
 from hal.bus import Level
 from rtdb.recording import Recording
 
@@ -27,9 +27,6 @@ from .metrics import METRICS, Measured
 from .onset import Onset
 from .pool import Lost, spread
 from .scenario import SUFFIX, Scenario, ScenarioError, library, load_scenario
-
-if TYPE_CHECKING:
-    from autonomy.wiring import Stack
 
 ALL_GOOD, FAILED, BROKEN = 0, 1, 3  # exit status, as of `fairway drive`
 MOVES_OF_FAILED = 3
@@ -185,22 +182,6 @@ def shard_of(text: str) -> tuple[int, int]:
     return int(i), int(n)
 
 
-def stack_with(scenario: Scenario, uses: Sequence[str]) -> "Stack":
-    """Load a scenario's stack with modules swapped, COMPONENT=FILE.py:Class each; ModuleError says what is wrong."""
-    from autonomy.module import ModuleError
-    from autonomy.wiring import load_stack, make_module
-
-    stack = load_stack(scenario.stack_path())
-    for use in uses:
-        component, separator, module = use.partition("=")
-        if not separator:
-            raise ModuleError(f"--use {use}: expected COMPONENT=FILE.py:Class")
-        stack = stack.use(component, module)
-    for wire in stack.wires:
-        make_module(wire)
-    return stack
-
-
 # -- one run ----------------------------------------------------------------------------------------------------------
 
 
@@ -230,7 +211,10 @@ def _drive_and_judge(task: Task) -> Result:
     recording.unlink(missing_ok=True)
     try:
         setup = Setup(
-            scenario=task.scenario, seed=task.seed, level=task.level, stack=stack_with(task.scenario, task.uses)
+            scenario=task.scenario,
+            seed=task.seed,
+            level=task.level,
+            stack=stack_with(task.scenario.stack_path(), task.uses),
         )
         drive(setup, recording)
         return judge(Recording(recording), task.scenario.parsed_criteria)
@@ -289,7 +273,9 @@ def tasks_of(
     """List what to run: the first `seeds` seeds of each scenario, or with None as many as each file asks for."""
     tasks = []
     for file, scenario in chosen:
-        stack_with(scenario, uses)  # what is wrong with a stack or a student's file is said before anything starts
+        stack_with(
+            scenario.stack_path(), uses
+        )  # what is wrong with a stack or a student's file is said before anything starts
         golden = load_golden(golden_path(file))
         tasks += [
             Task(file, scenario, seed, out / scenario.id / str(seed), tuple(uses), level, golden, strict)

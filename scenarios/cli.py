@@ -15,7 +15,6 @@ from .cli_regression import register as register_regression
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from autonomy.wiring import Stack
     from rtdb import Store
 
     from .judge import Result
@@ -72,6 +71,8 @@ def drive(
     """Drive a scenario and judge it."""
     from rich.console import Console
 
+    from autonomy.wiring import stack_with
+
     from .cli_regression import after_drive
     from .report import show
     from .run import Setup
@@ -84,7 +85,7 @@ def drive(
     if by_hand and not sys.stdin.isatty():
         raise typer.BadParameter("the keyboard is needed: standard input is not a terminal", param_hint="--by-hand")
     plan = load_scenario(scenario)
-    stack = _stack(plan.stack_path(), use or [])
+    stack = stack_with(plan.stack_path(), use or [])
     folder = out / plan.id / str(seed)
     folder.mkdir(parents=True, exist_ok=True)
     setup = Setup(
@@ -211,21 +212,6 @@ def replay(
     typer.echo(f"{rrd}")
     if open_it:
         open_viewer(rrd, typer.echo)
-
-
-def _stack(path: Path, uses: list[str]) -> "Stack":
-    from autonomy.module import ModuleError
-    from autonomy.wiring import load_stack, make_module
-
-    stack = load_stack(path)
-    for use in uses:
-        component, separator, module = use.partition("=")
-        if not separator:
-            raise ModuleError(f"--use {use}: expected COMPONENT=FILE.py:Class")
-        stack = stack.use(component, module)
-    for wire in stack.wires:
-        make_module(wire)  # what is wrong with a student's file is said before anything starts
-    return stack
 
 
 @app.command()

@@ -7,7 +7,8 @@ component that is due takes the oldest data time of its inputs, and its outputs 
 import math
 from dataclasses import dataclass
 
-from autonomy.wiring import Stack, load_module
+from autonomy.loading import load_module
+from autonomy.wiring import Stack
 
 BURST_TICKS = 2  # the HAL sends commands every 20 ms
 SENSOR_TICKS = {"odometry/travel": 2}  # sensors that age the outputs: period of their frames
@@ -36,19 +37,23 @@ def latency(stack: Stack) -> list[Latency]:
 def _follow(stack: Stack, sensor: str, sensor_ticks: int, period: int) -> list[int]:
     """Ages of the sensor's data at each command burst of the last hyperperiod."""
     shown: dict[str, int] = {}  # object -> measuring tick of the data that it shows
-    pending: dict[str, int] = {}  # written, shows from the next tick on
+    pending: dict[int, dict[str, int]] = {}  # by the tick from which it shows
     modules = {wire.component: load_module(wire.module) for wire in stack.wires}
+    wired = {wire.component: wire.objects() for wire in stack.wires}
     ages = []
     for tick in range(20 * period):
-        shown |= pending
-        pending = {sensor: tick} if tick % sensor_ticks == 0 else {}
+        shown |= pending.pop(tick, {})
+        if tick % sensor_ticks == 0:
+            pending.setdefault(tick + 1, {})[sensor] = tick
         for wire in stack.wires:
             if tick % wire.every != wire.phase:
                 continue
             cls = modules[wire.component]
-            origins = [shown[p] for name, p in wire.inputs.items() if p in shown and not cls.inputs[name].static]
+            objects = wired[wire.component]
+            origins = [shown[o] for name, o in objects.items() if o in shown and not cls.inputs[name].static]
             if origins:
-                pending |= {f"{wire.component}/{name}": min(origins) for name in cls.outputs}
+                outputs = {f"{wire.component}/{name}": min(origins) for name in cls.outputs}
+                pending.setdefault(tick + 1 + wire.latency_cycles, {}).update(outputs)
         if tick % BURST_TICKS == 0 and stack.command in shown and tick >= 19 * period:
             ages.append(tick - shown[stack.command])
     return ages

@@ -69,8 +69,8 @@ class Setup:
     """How to run a scenario.
 
     plant: python is the readable form of the cart's dynamics; db: name of a shared store, None for a private one;
-    placement: where modules run; by_hand: the keyboard drives; shuffle: seed that permutes order, placement over
-    processes and delays, none of which may change the trace.
+    placement: modules in this process, or each in its own; by_hand: the keyboard drives; shuffle: seed that permutes
+    order, placement and delays, none of which may change the trace; faults: folder for the steps that broke a module.
     """
 
     scenario: Scenario
@@ -82,6 +82,7 @@ class Setup:
     placement: Placement = "inline"
     by_hand: bool = False
     shuffle: int | None = None
+    faults: Path | None = None
 
 
 class DriveError(Exception):
@@ -101,7 +102,7 @@ class Drive:
         self.stack = setup.stack or load_stack(scenario.stack_path())
         if setup.by_hand:
             self.stack = by_hand(self.stack)
-        self._children: list[subprocess.Popen[str]] = []
+        self._children: dict[str, subprocess.Popen[str]] = {}  # by component
         self._hand: HandHost | None = None
         self.lost = ""
         self._order = random.Random(setup.shuffle) if setup.shuffle is not None else None  # not part of the drive
@@ -154,15 +155,16 @@ class Drive:
         self._statuses = [self.cart.find(n, ModuleStatus) for n, record in objects.items() if record == "ModuleStatus"]
 
     def _start_modules(self, name: str | None) -> None:
-        groups: list[list[Wire]] = [[], [], []]  # the first one here, each other in a process of its own
+        here: list[Wire] = []
         for wire in self.stack.wires:
-            k = self._order.randrange(3) if self._order else int(self.setup.placement == "process")
-            groups[k].append(wire)
-        for k, group in enumerate(groups[1:]):
-            if group and name is not None:
-                delay_seed = None if self.setup.shuffle is None else self.setup.shuffle * 2 + k
-                self._children.append(spawn(name, tuple(group), self.setup.seed, delay_seed))
-        self._hosts = [Host(self.cart, wire, self.setup.seed) for wire in groups[0]]
+            apart = self._order.random() < 0.5 if self._order else self.setup.placement == "process"
+            if apart and name is not None:
+                delay_seed = None if self._order is None else self._order.randrange(1 << 32)
+                child = spawn(name, (wire,), self.setup.seed, delay_seed, self.setup.faults)
+                self._children[wire.component] = child
+            else:
+                here.append(wire)
+        self._hosts = [Host(self.cart, wire, self.setup.seed, faults=self.setup.faults) for wire in here]
         self._wait_for_stack()
         for host in self._hosts:
             host.connect()
@@ -176,9 +178,9 @@ class Drive:
             missing = wanted - {obj.name.removesuffix("/status") for obj in self.cart.objects("*/status")}
             if not missing:
                 return
-            for child in self._children:
+            for component, child in self._children.items():
                 if child.poll() is not None:
-                    raise DriveError(f"the process of {', '.join(sorted(missing))} ended at once", invalid=False)
+                    raise DriveError(f"the process of {component} ended at once", invalid=False)
             if time.monotonic() > deadline:
                 names = ", ".join(sorted(missing))
                 raise DriveError(f"{names} did not come within {PARTICIPANT_S:.0f} s", invalid=False)
@@ -222,11 +224,21 @@ class Drive:
             step(cycle, t_ns)
         while self._events and self._events[0][0] <= t_ns:
             self._fault.write(self._events.pop(0)[1], t_ns)
-        if self._children and not cart.wait_done(cycle, PARTICIPANT_S):
-            raise DriveError(f"a module did not finish cycle {cycle} within {PARTICIPANT_S:.0f} s", invalid=False)
-        if not self.lost and any(child.poll() is not None for child in self._children):
-            self.lost = f"a process of modules ended in cycle {cycle}"  # the cart goes on, and its limits stop it
+        if self._children:
+            self._wait_for_processes(cycle)
         return self._over(cycle)
+
+    def _wait_for_processes(self, cycle: int) -> None:
+        """Wait until all modules are done with a cycle; one that hangs is ended. The cart's limits stop the cart."""
+        while not self.cart.wait_done(cycle, PARTICIPANT_S):
+            for info in self.cart.components():
+                if info.name in self._children and info.alive and info.done < cycle:
+                    self.lost = self.lost or f"the process of {info.name} hung in cycle {cycle}, and was ended"
+                    self._children[info.name].kill()
+                    self._children[info.name].wait()
+        for component, child in self._children.items():
+            if not self.lost and child.poll() is not None:
+                self.lost = f"the process of {component} ended in cycle {cycle} ({ending(child.returncode)})"
 
     def _write_scan(self, _cycle: int, t_ns: int) -> None:
         scan = self.sim.scan()
@@ -274,10 +286,11 @@ class Drive:
 
     def close(self) -> None:
         """End the processes of this drive and give the stores back."""
-        for child in self._children:
+        for child in self._children.values():
             if child.stdin is not None:
                 child.stdin.close()
             child.terminate()
+        for child in self._children.values():
             child.wait()
         self._children.clear()
         if self._hand is not None:
@@ -294,6 +307,11 @@ class Drive:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def ending(code: int) -> str:
+    """Say how a process ended."""
+    return f"exit status {code}" if code >= 0 else signal.Signals(-code).name
 
 
 @contextmanager

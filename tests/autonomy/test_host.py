@@ -50,7 +50,7 @@ class Probe(Module):
 
     def step(self) -> None:
         self.seen.append((self.t_ns, self.pose.x_m, self.gps, self.course))
-        self.drive = DriveCommand(speed_mps=self.gain * self.pose.x_m)
+        self.drive = DriveCommand(speed_mps=0.1 * self.gain * self.pose.x_m)
         self.state = FollowState(waypoint=len(self.seen))
         Probe.task(self)
 
@@ -194,7 +194,7 @@ def test_outputs_are_held_then_safe_while_an_input_is_stale() -> None:
         shown.append(rig.value("drive", DriveCommand))
     assert len(rig.module.seen) == steps
     held, safe = shown[: HOLD_STEPS + 1], shown[HOLD_STEPS + 1 :]  # what is written in a cycle shows in the next
-    assert held == [DriveCommand(speed_mps=1.5 * 3)] * len(held)
+    assert held == [DriveCommand(speed_mps=0.1 * 1.5 * 3)] * len(held)
     assert safe == [SAFE] * len(safe)
     assert safe
 
@@ -266,8 +266,8 @@ def test_parameters_come_from_the_wiring_else_from_the_class() -> None:
     by_default, wired = Rig(), Rig(params={"gain": 4})
     for rig in (by_default, wired):
         rig.ticks(2)
-    assert by_default.value("drive", DriveCommand).speed_mps == 1.5
-    assert wired.value("drive", DriveCommand).speed_mps == 4.0
+    assert by_default.value("drive", DriveCommand).speed_mps == 0.1 * 1.5
+    assert wired.value("drive", DriveCommand).speed_mps == 0.1 * 4.0
     assert type(wired.module.gain) is float  # a whole number in JSON is still a float here
 
 
@@ -333,7 +333,7 @@ def test_what_a_module_does_wrong_latches_and_is_said_in_its_status(case: str) -
     Probe.task = lambda probe: None  # it would work again, but nobody trusts it any more
     for _ in range(HOLD_STEPS):
         rig.tick()
-        assert rig.value("drive", DriveCommand) == DriveCommand(speed_mps=1.5 * 3), "held"
+        assert rig.value("drive", DriveCommand) == DriveCommand(speed_mps=0.1 * 1.5 * 3), "held"
     rig.ticks(3)
     assert len(rig.module.seen) == 4
     assert rig.status.state is ModuleState.FAULT
@@ -421,7 +421,7 @@ class Downstream(Module):
     drive = Output(DriveCommand, safe=SAFE)
 
     def step(self) -> None:
-        self.drive = msgspec.structs.replace(self.drive_in, steer_rad=0.5)
+        self.drive = msgspec.structs.replace(self.drive_in, steer_rad=0.25)
 
 
 def test_other_modules_go_on_when_one_breaks() -> None:
@@ -437,7 +437,7 @@ def test_other_modules_go_on_when_one_breaks() -> None:
         sample = found.visible(rig.store.cycle)
         speeds.append(None if sample is None else sample.value.speed_mps)
     assert after.fault == ""
-    assert speeds == [None, None, 1.5, 3.0, 4.5, 6.0, 6.0, 6.0, *[SAFE.speed_mps] * 4]
+    assert speeds == [None, None, *(0.1 * 1.5 * k for k in (1, 2, 3, 4, 4, 4)), *[SAFE.speed_mps] * 4]
 
 
 # -- wiring to the store --------------------------------------------------------------------------------------------

@@ -9,7 +9,8 @@ import pytest
 from autonomy import ModuleError
 from autonomy.follow import Follow
 from autonomy.guard import Guard
-from autonomy.wiring import Stack, Wire, load_module, load_stack, make_module
+from autonomy.loading import load_module, make_module
+from autonomy.wiring import Stack, Wire, load_stack
 
 REFERENCE = Path(__file__).resolve().parents[2] / "autonomy" / "stacks" / "reference.json"
 

@@ -1,0 +1,142 @@
+"""Pointers: what an input is wired to. `localise/pose` is an object; `localise/pose#/x_m` is a number in it (RFC 6901).
+
+What does not fit is said when the pointer is resolved, in one line: no such object, another record, another unit, a
+range that the module cannot work with. Objects without a record (JSON) name units in their keys; what they hold is
+checked at each read, and a value that does not fit counts as absent.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from rtdb import Object, Record, RecordError, Sample, Schema, Store, schema_of
+from rtdb.json_object import is_json, number_at
+from rtdb.layout import Field, Spec
+
+from .module import NO_NUMBERS, InputPort, ModuleError, Ranges
+from .ranges import range_of, sound, what_is_wrong
+
+
+class Unusable(Exception):
+    """What a pointer shows now cannot be used; the message says why."""
+
+
+class Link:
+    """An input joined to its object."""
+
+    __slots__ = ("json", "obj", "value")
+
+    def __init__(self, obj: Object[Any], value: Callable[[Sample[Any]], Any] | None, json: bool) -> None:
+        self.obj, self.json = obj, json
+        self.value = value
+        """Makes the input's value of a sample, or raises Unusable; None where the sample's own value is it."""
+
+
+def split(pointer: str) -> tuple[str, str | None]:
+    """Give the object's name and the JSON Pointer into it, None where there is none."""
+    name, sharp, path = pointer.partition("#")
+    return name, path if sharp else None
+
+
+def link(store: Store, pointer: str, port: InputPort[Any], timeout_s: float = 0.0) -> Link:
+    """Resolve a pointer for a port. ModuleError says what does not fit; RtdbError that there is no such object."""
+    name, path = split(pointer)
+    if port.cls is float:
+        if path is None:
+            raise ModuleError(f"a number [{port.unit}] is wired to a field: {name}#/FIELD")
+        return _number(store.find(name, timeout_s=timeout_s), path, port)
+    if path is not None:
+        raise ModuleError(f"a {port.cls.__name__} is wired to a whole object: {name}")
+    obj = store.find(name, timeout_s=timeout_s)
+    if is_json(obj.stored.fields):
+        return Link(obj, _record_of_json(port.cls, port.ranges), json=True)
+    obj = store.find(name, port.cls)
+    _check_ranges(port.cls.__name__, obj.stored, port.ranges)
+    if not port.ranges:
+        return Link(obj, None, json=False)
+    is_sound, ranges = sound(port.cls, port.ranges), port.ranges
+
+    def narrowed(sample: Sample[Any]) -> Any:
+        if is_sound(sample.value):
+            return sample.value
+        raise Unusable(what_is_wrong(sample.value, ranges))
+
+    return Link(obj, narrowed, json=False)
+
+
+def _check_ranges(what: str, stored: Schema, wanted: Ranges) -> None:
+    """Refuse an object whose writer declares more than the port can work with."""
+    for field in stored.fields:
+        low, high = range_of(field, wanted)
+        if field.name in wanted and not low <= field.spec.low <= field.spec.high <= high:
+            raise ModuleError(
+                f"its {what} may have {field.name} from {field.spec.low:g} to {field.spec.high:g} {field.spec.unit}, "
+                f"this input takes {low:g} to {high:g}; narrow the output, or widen the input"
+            )
+
+
+def _number(obj: Object[Any], path: str, port: InputPort[Any]) -> Link:
+    low, high = port.ranges[""]
+    if is_json(obj.stored.fields):
+        unit, json = None, True
+    else:
+        spec, json = field_at(obj.stored, path), False
+        unit = spec.unit or "1"
+        if unit != port.unit:
+            raise ModuleError(f"{path} is in {unit}, this input is in {port.unit}")
+        if not low <= spec.low <= spec.high <= high:
+            raise ModuleError(
+                f"{path} may be {spec.low:g} to {spec.high:g} {unit}, this input takes {low:g} to {high:g}; "
+                "narrow the output, or widen the input"
+            )
+
+    def value(sample: Sample[Any]) -> float:
+        try:
+            return number_at(sample.value, path, port.unit, low=low, high=high, unit_in_wiring=unit)
+        except RecordError as error:
+            raise Unusable(str(error)) from error
+
+    return Link(obj, value, json)
+
+
+def field_at(schema: Schema, path: str) -> Spec:
+    """Give the declaration of the number at a JSON Pointer into a record; ModuleError where there is none."""
+    fields: dict[str, Field] = {f.name: f for f in schema.fields}
+    found: Field | None = None
+    for token in path.split("/")[1:]:
+        if found is not None and found.spec.shape != "one" and token.isdigit():
+            continue
+        found = fields.get(token)
+        if found is None:
+            raise ModuleError(f"{schema.name} has no {path}; there is {', '.join('/' + name for name in fields)}")
+        fields = {f.name: f for f in found.record.fields} if found.spec.kind == "record" else {}
+    if found is None or found.spec.kind in NO_NUMBERS:
+        raise ModuleError(f"{path or 'the whole object'} is no number; point at one: #/FIELD")
+    return found.spec
+
+
+def _record_of_json(cls: type[Record], ranges: Ranges) -> Callable[[Sample[Any]], Record]:
+    """Make the function that reads a record of plain numbers out of a JSON object, by the names of its fields."""
+    fields = schema_of(cls).fields
+    required = {info.name for info in msgspec.structs.fields(cls) if info.required}
+    strange = [f.name for f in fields if f.spec.kind in NO_NUMBERS or f.spec.shape != "one"]
+    if strange:
+        raise ModuleError(f"a {cls.__name__} cannot be read from JSON: {', '.join(strange)} is no plain number")
+
+    def value(sample: Sample[Any]) -> Record:
+        numbers: dict[str, Any] = {}
+        try:
+            for f in fields:
+                if f.name in sample.value or f.name in required:
+                    low, high = range_of(f, ranges)
+                    number = number_at(
+                        sample.value, f"/{f.name}", f.spec.unit or "1", low=low, high=high,
+                        unit_in_wiring=f.spec.unit or "1",
+                    )  # fmt: skip
+                    numbers[f.name] = number if f.spec.kind in ("f8", "f4") else int(number)
+        except RecordError as error:
+            raise Unusable(str(error)) from error
+        return cls(**numbers)
+
+    return value
