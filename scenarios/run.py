@@ -1,4 +1,4 @@
-"""Run: the only place where a cart is put together. A scenario, a seed and a stack become a recording.
+"""Run: a scenario, a seed and a stack become a recording.
 
 Each tick: the world moves on to the edge, the edge, then recorder, drivers and modules on the new cut. Two stores
 tick together: `cart` is all that modules can know, `world` is the truth and stays private to this process.
@@ -22,41 +22,22 @@ from autonomy.host import Host
 from autonomy.process import spawn
 from autonomy.wiring import Stack, Wire, load_stack
 from hal.bus import Level
-from hal.drivers.compass import CompassDriver
-from hal.drivers.gps import GpsDriver
-from hal.host import CartHost, CompassHost, GpsHost
-from hal.signals import (
-    ActorsTruth,
-    CartTruth,
-    Clearance,
-    Course,
-    DriveCommand,
-    FaultEvent,
-    FollowState,
-    GuardState,
-    Hold,
-    ModuleState,
-    ModuleStatus,
-    Scan,
-    Scene,
-    SystemState,
-)
-from hal.signals import Site as SiteRecord
-from rtdb import STATIC, Object, Record, Store
+from hal.signals import FollowState, GuardState, Hold, ModuleState, ModuleStatus, SystemState
+from rtdb import Object, Record, Store
 from rtdb.recorder import Recorder
-from sim.cart import GPS_LATENCY_NS, PlantKind, SimCart
+from sim.cart import PlantKind
 
-from . import plan
 from .by_hand import HandHost, by_hand
-from .course import CourseImpossible
+from .cart import TICK_NS, CartSetup, DriveError, SimulatedCart
 from .scenario import Scenario
 from .version import version
+
+__all__ = ["TICK_NS", "Drive", "DriveError", "Setup", "drive"]
 
 if TYPE_CHECKING:
     import subprocess
 
 log = logging.getLogger(__name__)
-TICK_NS = 10_000_000
 STORE_BYTES = 8 << 20
 SETTLE_S = 1.0  # how long a finished cart stands before the drive ends
 PARTICIPANT_S = 60.0
@@ -85,14 +66,6 @@ class Setup:
     faults: Path | None = None
 
 
-class DriveError(Exception):
-    """A drive cannot be done, or a part of it is gone. `invalid`: the scenario is to blame, not a module."""
-
-    def __init__(self, message: str, *, invalid: bool) -> None:
-        super().__init__(message)
-        self.invalid = invalid
-
-
 class Drive:
     """A drive under way: `tick` until it says that it is over. Use it in a `with`."""
 
@@ -107,7 +80,7 @@ class Drive:
         self.lost = ""
         self._order = random.Random(setup.shuffle) if setup.shuffle is not None else None  # not part of the drive
         self._hosts: list[Host] = []
-        self.sim: SimCart = None  # type: ignore[assignment]  # until assembled
+        self.simulated: SimulatedCart | None = None
         apart = setup.placement == "process" or setup.shuffle is not None
         name = setup.db if setup.db is not None else f"drive-{os.getpid()}" if apart else None
         self.cart = Store.create(name, tick_ns=TICK_NS, t0_ns=scenario.t0_ns, size=STORE_BYTES, deterministic=True)
@@ -121,30 +94,19 @@ class Drive:
     # -- assembly -------------------------------------------------------------------------------------------------
 
     def _assemble(self, name: str | None) -> None:
-        scenario, rng = self.setup.scenario, plan.rng_of(self.setup.seed)
-        site = scenario.load_site()
-        try:
-            course = plan.course_record(scenario, site, rng)
-        except CourseImpossible as error:
-            raise DriveError(str(error), invalid=True) from error
-        self._write_mission(plan.site_record(site), course)
-        self.sim = SimCart(plan.sim_setup(scenario, site, self.setup.level, self.setup.plant, rng), rng)
-        self.sim.bus.faults += plan.bus_faults(scenario, rng)
-        self._events = plan.fault_events(scenario)
-        self._write_world()
-        self._drivers: list[GpsHost | CompassHost] = [GpsHost(self.cart, GpsDriver(GPS_LATENCY_NS), self.sim.gps)]
-        if self.sim.compass is not None:
-            self._drivers.append(CompassHost(self.cart, CompassDriver(self.sim.declination_rad), self.sim.compass))
-        self._scan = self.cart.join("laser").insert("scan", Scan, history_s=0.5) if scenario.laser else None
-        self.hal = CartHost(self.cart, self.sim.bus)
-        if self.setup.by_hand:
+        setup = self.setup
+        self.simulated = SimulatedCart(
+            CartSetup(scenario=setup.scenario, seed=setup.seed, level=setup.level, plant=setup.plant),
+            self.cart,
+            self.world,
+        )
+        self.sim, self.hal = self.simulated.sim, self.simulated.hal
+        if setup.by_hand:
             self._hand = HandHost(self.cart).__enter__()
         self._start_modules(name)
-        self.hal.obey(self.cart.find(self.stack.command, DriveCommand))
+        self.simulated.obey(self.stack.command)
         self._work: list[Callable[[int, int], None]] = [
-            *(driver.step for driver in self._drivers),
-            self.hal.step,
-            *([self._write_scan] if self._scan else []),
+            *self.simulated.work,
             *([self._hand.step] if self._hand else []),
             *(host.step for host in self._hosts),
         ]
@@ -186,20 +148,6 @@ class Drive:
                 raise DriveError(f"{names} did not come within {PARTICIPANT_S:.0f} s", invalid=False)
             self.cart.core.wait_directory(version, 100_000_000)
 
-    def _write_mission(self, site: SiteRecord, course: Course) -> None:
-        mission, t0_ns = self.cart.join("mission"), self.cart.t0_ns
-        mission.insert("site", SiteRecord, history_s=0.05, flags=STATIC).write(site, t0_ns)
-        mission.insert("course", Course, history_s=0.05, flags=STATIC).write(course, t0_ns)
-
-    def _write_world(self) -> None:
-        world = self.world.join("world")
-        self._truth = world.insert("cart", CartTruth, every=2)
-        self._fault = world.insert("fault", FaultEvent, history_s=0.1)
-        self._clearance = world.insert("clearance", Clearance, every=10) if self.sim.world else None
-        self._actors = world.insert("actors", ActorsTruth, every=10) if self.sim.setup.actors else None
-        if self.sim.world:
-            world.insert("scene", Scene, history_s=0.05, flags=STATIC).write(self.sim.scene, self.world.t0_ns)
-
     # -- running --------------------------------------------------------------------------------------------------
 
     @property
@@ -210,8 +158,8 @@ class Drive:
     def tick(self, recorder: Recorder | None = None) -> bool:
         """Do one cycle; True when the drive is over."""
         cart, world = self.cart, self.world
-        self.sim.advance(TICK_NS)
-        self._tell_truth(cart.cycle + 1)
+        assert self.simulated is not None
+        self.simulated.before_edge(cart.cycle + 1)
         cycle = cart.tick()
         world.tick()
         t_ns = cart.now_ns
@@ -222,8 +170,7 @@ class Drive:
             self._order.shuffle(work)  # all of them read this cut and write for later ones: the order cannot matter
         for step in work:
             step(cycle, t_ns)
-        while self._events and self._events[0][0] <= t_ns:
-            self._fault.write(self._events.pop(0)[1], t_ns)
+        self.simulated.tell_faults(t_ns)
         if self._children:
             self._wait_for_processes(cycle)
         return self._over(cycle)
@@ -239,21 +186,6 @@ class Drive:
         for component, child in self._children.items():
             if not self.lost and child.poll() is not None:
                 self.lost = f"the process of {component} ended in cycle {cycle} ({ending(child.returncode)})"
-
-    def _write_scan(self, _cycle: int, t_ns: int) -> None:
-        scan = self.sim.scan()
-        if scan is not None and self._scan is not None:
-            self._scan.write(scan, t_ns)
-
-    def _tell_truth(self, next_cycle: int) -> None:
-        """Write what shows at the coming edge: the truth of that very edge."""
-        if next_cycle % 2 == 0:
-            self._truth.write(self.sim.truth(), self.sim.t_ns)
-        if next_cycle % 10 == 0:
-            if self._clearance is not None:
-                self._clearance.write(self.sim.take_clearance(), self.sim.t_ns)
-            if self._actors is not None:
-                self._actors.write(self.sim.actors(), self.sim.t_ns)
 
     def _over(self, cycle: int) -> bool:
         """Say whether the drive ends: by time, by hand, or because the cart stands and will not go on."""
@@ -295,8 +227,8 @@ class Drive:
         self._children.clear()
         if self._hand is not None:
             self._hand.__exit__(None, None, None)
-        if self.sim is not None:  # not assembled to the end
-            self.sim.close()
+        if self.simulated is not None:  # not assembled to the end
+            self.simulated.close()
         self.cart.close()
         self.world.close()
 
