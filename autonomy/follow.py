@@ -72,14 +72,15 @@ class Follow(Module):
 
     def _plan(self) -> list[Station]:
         """Turn the course into a line in M that begins where the cart stands."""
-        plane, course = LocalPlane.at(self.site.lat_rad, self.site.lon_rad), self.course
-        corners = [plane.to_map(lat, lon) for lat, lon in zip(course.lat_rad, course.lon_rad, strict=True)]
-        corners.insert(0, (self.pose.x_m, self.pose.y_m))
-        allowed = [self.cut * radius_m for radius_m in course.radius_m]
-        points = rounded(corners, allowed, self.turn_radius_m)
-        radii = widened(bend_radii(points), self.turn_radius_m)
-        speeds = [min(course.speed_mps, math.sqrt(self.lateral_mps2 * radius_m)) for radius_m in radii]
-        return stations(points, speeds, self.decel_mps2)
+        return planned_line(
+            self.site,
+            self.course,
+            (self.pose.x_m, self.pose.y_m),
+            cut=self.cut,
+            turn_radius_m=self.turn_radius_m,
+            lateral_mps2=self.lateral_mps2,
+            decel_mps2=self.decel_mps2,
+        )
 
     def _goal(self, lookahead_m: float) -> Point:
         """Give the point of the line a look-ahead on; beyond the end, straight on."""
@@ -113,6 +114,28 @@ class Follow(Module):
 
 
 # -- the line -------------------------------------------------------------------------------------------------------
+
+
+def planned_line(
+    site: Site,
+    course: Course,
+    start: Point,
+    *,
+    cut: float = 0.5,
+    turn_radius_m: float = 3.8,
+    lateral_mps2: float = 1.2,
+    decel_mps2: float = 0.7,
+) -> list[Station]:
+    """Plan the line from a start through the way-points, in M, with the speed that it allows at each station.
+
+    cut: share of a way-point's radius by which a corner may be missed.
+    """
+    plane = LocalPlane.at(site.lat_rad, site.lon_rad)
+    corners = [start, *(plane.to_map(lat, lon) for lat, lon in zip(course.lat_rad, course.lon_rad, strict=True))]
+    points = rounded(corners, [cut * radius_m for radius_m in course.radius_m], turn_radius_m)
+    radii = widened(bend_radii(points), turn_radius_m)
+    speeds = [min(course.speed_mps, math.sqrt(lateral_mps2 * radius_m)) for radius_m in radii]
+    return stations(points, speeds, decel_mps2)
 
 
 def rounded(corners: list[Point], allowed_m: list[float], least_radius_m: float) -> list[tuple[float, float, int]]:
