@@ -64,7 +64,8 @@ class Network:
                 x = np.tanh(x)
             elif activation == "relu":
                 x = np.maximum(x, 0.0)
-        return np.clip(x, -1.0, 1.0)
+        action: Array = np.clip(x, -1.0, 1.0)
+        return action
 
 
 def save_policy(path: Path, seat: str, step_s: float, network: Network, about: str = "") -> None:

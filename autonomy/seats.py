@@ -26,6 +26,7 @@ from hal.signals import (
     Pose,
     SafetyState,
     Scan,
+    Scene,
     Site,
     SystemState,
     wrap,
@@ -266,7 +267,14 @@ class PlanSeat(Seat):
     n_actions: ClassVar[int] = 8
     drives: ClassVar[bool] = False
     ASIDE_M = 4.0
+    map = Input(Scene, optional=True, static=True, pointer="mission/map")
+    pose = Input(Pose, optional=True, static=True, max_age_s=0.5, pointer="localise/pose")
     route = Output(Course, safe=Course())
+
+    def place(self) -> tuple[float, float, float]:
+        """Give the estimated pose, or where the wheels have it."""
+        pose = self.pose
+        return super().place() if pose is None else (pose.x_m, pose.y_m, pose.yaw_rad)
 
     def see(self) -> list[float]:
         """Give the numbers of the features."""

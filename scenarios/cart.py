@@ -16,7 +16,6 @@ from hal.signals import (
     CartTruth,
     Clearance,
     Course,
-    DriveCommand,
     FaultEvent,
     Scan,
     Scene,
@@ -24,9 +23,11 @@ from hal.signals import (
 from hal.signals import Site as SiteRecord
 from rtdb import STATIC, Store
 from sim.cart import GPS_LATENCY_NS, PlantKind, SimCart
+from sim.world import World
 
 from . import plan
 from .course import CourseImpossible
+from .randomise import Kind, Randomised, draw
 from .scenario import Scenario
 
 TICK_NS = 10_000_000
@@ -42,12 +43,17 @@ class DriveError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CartSetup:
-    """Which cart, where: a scenario with its seed, how much of the wire, and which form of the plant."""
+    """Which cart, where: a scenario with its seed, how much of the wire, which form of the plant, what is randomised.
+
+    make_world: see scenarios.run.Setup.
+    """
 
     scenario: Scenario
     seed: int = 0
     level: Level = "wire"
     plant: PlantKind = "compiled"
+    randomise: Kind = "none"
+    make_world: Callable[[Scene], World] | None = None
 
 
 class SimulatedCart:
@@ -63,10 +69,12 @@ class SimulatedCart:
             raise DriveError(str(error), invalid=True) from error
         self.course = course
         self._write_mission(plan.site_record(site), course)
-        self.sim = SimCart(plan.sim_setup(scenario, site, setup.level, setup.plant, rng), rng)
+        drawn = draw(setup.randomise, rng("randomise"))
+        sim_setup = plan.sim_setup(scenario, site, setup.level, setup.plant, rng, drawn)
+        self.sim = SimCart(sim_setup, rng, setup.make_world)
         self.sim.bus.faults += plan.bus_faults(scenario, rng)
         self._events = plan.fault_events(scenario)
-        self._write_world()
+        self._write_world(drawn)
         drivers: list[GpsHost | CompassHost] = [GpsHost(cart, GpsDriver(GPS_LATENCY_NS), self.sim.gps)]
         if self.sim.compass is not None:
             drivers.append(CompassHost(cart, CompassDriver(self.sim.declination_rad), self.sim.compass))
@@ -79,12 +87,14 @@ class SimulatedCart:
         ]
 
     def _write_mission(self, site: SiteRecord, course: Course) -> None:
-        mission, t0_ns = self.cart.join("mission"), self.cart.t0_ns
-        mission.insert("site", SiteRecord, history_s=0.05, flags=STATIC).write(site, t0_ns)
-        mission.insert("course", Course, history_s=0.05, flags=STATIC).write(course, t0_ns)
+        mission, now_ns = self.cart.join("mission"), self.cart.now_ns
+        mission.insert("site", SiteRecord, history_s=0.05, flags=STATIC).write(site, now_ns)
+        mission.insert("course", Course, history_s=0.05, flags=STATIC).write(course, now_ns)
 
-    def _write_world(self) -> None:
+    def _write_world(self, drawn: Randomised) -> None:
         world = self.world.join("world")
+        if self.setup.randomise != "none":
+            world.insert("randomised", Randomised, history_s=0.05, flags=STATIC).write(drawn, self.world.t0_ns)
         self._truth = world.insert("cart", CartTruth, every=2)
         self._fault = world.insert("fault", FaultEvent, history_s=0.1)
         self._clearance = world.insert("clearance", Clearance, every=10) if self.sim.world else None
@@ -92,9 +102,9 @@ class SimulatedCart:
         if self.sim.world:
             world.insert("scene", Scene, history_s=0.05, flags=STATIC).write(self.sim.scene, self.world.t0_ns)
 
-    def obey(self, pointer: str) -> None:
+    def obey(self, pointer: str, timeout_s: float = 0.0) -> None:
         """Let the HAL obey a command in the store. While disabled only."""
-        self.hal.obey(self.cart.find(pointer, DriveCommand))
+        self.hal.obey(pointer, timeout_s)
 
     def before_edge(self, next_cycle: int) -> None:
         """Move the world on by a tick, and write what shows at the coming edge: the truth of that very edge."""

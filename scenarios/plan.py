@@ -13,9 +13,11 @@ from hal.signals import Site as SiteRecord
 from sim.actors import Actor
 from sim.cart import Outage, PlantKind, SimSetup, Start
 from sim.laser import LaserParams
+from sim.plant import CartParams
 from sim.site import Site
 
 from .course import hidden_course
+from .randomise import Randomised
 from .scenario import CanCorruptionFault, GpsOutageFault, HostSilenceFault, Scenario
 
 Rng = Callable[[str], np.random.Generator]
@@ -61,24 +63,31 @@ def course_record(scenario: Scenario, site: Site, rng: Rng) -> Course:
     )
 
 
-def sim_setup(scenario: Scenario, site: Site, level: Level, plant: PlantKind, rng: Rng) -> SimSetup:
+def sim_setup(
+    scenario: Scenario, site: Site, level: Level, plant: PlantKind, rng: Rng, drawn: Randomised
+) -> SimSetup:
     """Give the simulated cart: it starts near its mark, as well as the crew puts it there."""
-    mark, drawn, laser = scenario.start, rng("start").normal(size=3), scenario.laser
+    mark, start, laser = scenario.start, rng("start").normal(size=3), scenario.laser
     return SimSetup(
-        site=site,
+        site=site.model_copy(update={"friction": site.friction * drawn.friction_factor}),
         start=Start(
-            x_m=mark.east_m + mark.position_sigma_m * drawn[0],
-            y_m=mark.north_m + mark.position_sigma_m * drawn[1],
-            yaw_rad=math.radians(mark.yaw_deg + mark.yaw_sigma_deg * drawn[2]),
+            x_m=mark.east_m + mark.position_sigma_m * start[0],
+            y_m=mark.north_m + mark.position_sigma_m * start[1],
+            yaw_rad=math.radians(mark.yaw_deg + mark.yaw_sigma_deg * start[2]),
         ),
         t_ns=scenario.t0_ns,
         level=level,
         plant=plant,
         gps_grade=scenario.gps.grade,
+        params=cart_params(drawn),
+        gps_factor=drawn.gps_factor,
+        compass_factor=drawn.compass_factor,
         outages=tuple(
-            Outage(at(scenario, f.at_s), at(scenario, f.at_s + f.for_s))
-            for f in scenario.faults
-            if isinstance(f, GpsOutageFault)
+            Outage(at(scenario, at_s), at(scenario, at_s + for_s))
+            for at_s, for_s in [
+                *((f.at_s, f.for_s) for f in scenario.faults if isinstance(f, GpsOutageFault)),
+                *([(drawn.outage_at_s, drawn.outage_for_s)] if drawn.outage_for_s > 0.0 else []),
+            ]
         ),
         compass=scenario.compass.personality,
         laser=None
@@ -88,6 +97,18 @@ def sim_setup(scenario: Scenario, site: Site, level: Level, plant: PlantKind, rn
             Actor(ObstacleKind[a.kind.upper()], a.path_m, a.speed_mps, at(scenario, a.at_s), a.pauses_s)
             for a in scenario.actors
         ),
+    )
+
+
+def cart_params(drawn: Randomised) -> CartParams:
+    """Give the cart that was drawn."""
+    usual = CartParams()
+    return CartParams(
+        load_kg=drawn.load_kg,
+        steer_lag_s=usual.steer_lag_s * drawn.steer_lag_factor,
+        steer_dead_time_s=drawn.steer_dead_time_s,
+        drive_lag_s=usual.drive_lag_s * drawn.drive_lag_factor,
+        brake_force_n=usual.brake_force_n * drawn.brake_factor,
     )
 
 

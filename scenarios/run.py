@@ -22,13 +22,15 @@ from autonomy.host import Host
 from autonomy.process import spawn
 from autonomy.wiring import Stack, Wire, load_stack
 from hal.bus import Level
-from hal.signals import FollowState, GuardState, Hold, ModuleState, ModuleStatus, SystemState
+from hal.signals import FollowState, GuardState, Hold, ModuleState, ModuleStatus, Scene, SystemState
 from rtdb import Object, Record, Store
 from rtdb.recorder import Recorder
 from sim.cart import PlantKind
+from sim.world import World
 
 from .by_hand import HandHost, by_hand
 from .cart import TICK_NS, CartSetup, DriveError, SimulatedCart
+from .randomise import Kind
 from .scenario import Scenario
 from .version import version
 
@@ -40,7 +42,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 STORE_BYTES = 8 << 20
 SETTLE_S = 1.0  # how long a finished cart stands before the drive ends
-PARTICIPANT_S = 60.0
+PARTICIPANT_S = 60.0  # for a process to come
+HANG_S = 75.0  # for the modules of a process to finish a cycle: longer than their own watch takes
 COLLECT_CYCLES = 3000
 Placement = Literal["inline", "process"]
 
@@ -51,7 +54,10 @@ class Setup:
 
     plant: python is the readable form of the cart's dynamics; db: name of a shared store, None for a private one;
     placement: modules in this process, or each in its own; by_hand: the keyboard drives; shuffle: seed that permutes
-    order, placement and delays, none of which may change the trace; faults: folder for the steps that broke a module.
+    order, placement and delays, none of which may change the trace; faults: folder for the steps that broke a module;
+    randomise: what else the seed changes, see scenarios/randomise.py;
+    agent: component that the caller of `tick` asks and answers (`Drive.agent`), as a gymnasium environment does;
+    make_world: gives the world of a scene, which stays its caller's, instead of one that ends with the drive.
     """
 
     scenario: Scenario
@@ -64,6 +70,9 @@ class Setup:
     by_hand: bool = False
     shuffle: int | None = None
     faults: Path | None = None
+    randomise: Kind = "none"
+    agent: str | None = None
+    make_world: Callable[[Scene], World] | None = None
 
 
 class Drive:
@@ -81,6 +90,7 @@ class Drive:
         self._order = random.Random(setup.shuffle) if setup.shuffle is not None else None  # not part of the drive
         self._hosts: list[Host] = []
         self.simulated: SimulatedCart | None = None
+        self.agent: Host | None = None
         apart = setup.placement == "process" or setup.shuffle is not None
         name = setup.db if setup.db is not None else f"drive-{os.getpid()}" if apart else None
         self.cart = Store.create(name, tick_ns=TICK_NS, t0_ns=scenario.t0_ns, size=STORE_BYTES, deterministic=True)
@@ -96,7 +106,14 @@ class Drive:
     def _assemble(self, name: str | None) -> None:
         setup = self.setup
         self.simulated = SimulatedCart(
-            CartSetup(scenario=setup.scenario, seed=setup.seed, level=setup.level, plant=setup.plant),
+            CartSetup(
+                scenario=setup.scenario,
+                seed=setup.seed,
+                level=setup.level,
+                plant=setup.plant,
+                randomise=setup.randomise,
+                make_world=setup.make_world,
+            ),
             self.cart,
             self.world,
         )
@@ -105,22 +122,26 @@ class Drive:
             self._hand = HandHost(self.cart).__enter__()
         self._start_modules(name)
         self.simulated.obey(self.stack.command)
+        self._list_work()
+        self._ended_s = 0.0
+        objects = {obj.name: obj.schema.name for obj in self.cart.objects()}
+        ends: dict[str, type[Record]] = {cls.__name__: cls for cls in (FollowState, GuardState)}
+        self._ends = [self.cart.find(n, ends[record]) for n, record in objects.items() if record in ends]
+        self._statuses = [self.cart.find(n, ModuleStatus) for n, record in objects.items() if record == "ModuleStatus"]
+
+    def _list_work(self) -> None:
+        assert self.simulated is not None
         self._work: list[Callable[[int, int], None]] = [
             *self.simulated.work,
             *([self._hand.step] if self._hand else []),
             *(host.step for host in self._hosts),
         ]
-        self._ended_s = 0.0
-        objects = {obj.name: obj.schema.name for obj in self.cart.objects()}
-        ends: list[tuple[str, type[Record]]] = [("follow/state", FollowState), ("guard/state", GuardState)]
-        self._ends = [self.cart.find(n, cls) for n, cls in ends if objects.get(n) == cls.__name__]
-        self._statuses = [self.cart.find(n, ModuleStatus) for n, record in objects.items() if record == "ModuleStatus"]
 
     def _start_modules(self, name: str | None) -> None:
         here: list[Wire] = []
         for wire in self.stack.wires:
             apart = self._order.random() < 0.5 if self._order else self.setup.placement == "process"
-            if apart and name is not None:
+            if apart and name is not None and wire.component != self.setup.agent:
                 delay_seed = None if self._order is None else self._order.randrange(1 << 32)
                 child = spawn(name, (wire,), self.setup.seed, delay_seed, self.setup.faults)
                 self._children[wire.component] = child
@@ -130,6 +151,9 @@ class Drive:
         self._wait_for_stack()
         for host in self._hosts:
             host.connect()
+        asked = [host for host in self._hosts if host.wire.component == self.setup.agent]
+        self._hosts = [host for host in self._hosts if host not in asked]
+        self.agent = asked[0] if asked else None
 
     def _wait_for_stack(self) -> None:
         """Tick 1 waits for every component that the stack names."""
@@ -177,7 +201,7 @@ class Drive:
 
     def _wait_for_processes(self, cycle: int) -> None:
         """Wait until all modules are done with a cycle; one that hangs is ended. The cart's limits stop the cart."""
-        while not self.cart.wait_done(cycle, PARTICIPANT_S):
+        while not self.cart.wait_done(cycle, HANG_S):
             for info in self.cart.components():
                 if info.name in self._children and info.alive and info.done < cycle:
                     self.lost = self.lost or f"the process of {info.name} hung in cycle {cycle}, and was ended"
@@ -202,14 +226,7 @@ class Drive:
         """Say whether nobody will move the cart again: it has arrived, is far astray, or something failed for good."""
         if self.hal.driver.state is SystemState.FAULT:
             return True
-        shown = {type(v): v for v in (self._value(obj, cycle) for obj in self._ends) if v is not None}
-        follow, guard = shown.get(FollowState), shown.get(GuardState)
-        broken = any(
-            isinstance(v := self._value(obj, cycle), ModuleStatus) and v.state is ModuleState.FAULT
-            for obj in self._statuses
-        )
-        arrived = isinstance(follow, FollowState) and follow.finished
-        return arrived or broken or (isinstance(guard, GuardState) and guard.hold is Hold.OUTSIDE)
+        return bool(self.lost) or any(is_end(self._value(obj, cycle)) for obj in (*self._ends, *self._statuses))
 
     @staticmethod
     def _value(obj: Object[Any], cycle: int) -> Any:
@@ -241,6 +258,15 @@ class Drive:
         self.close()
 
 
+def is_end(shown: object) -> bool:
+    """Say whether somebody will not go on: it has arrived, is far astray, or failed for good."""
+    if isinstance(shown, FollowState):
+        return shown.finished
+    if isinstance(shown, GuardState):
+        return shown.hold is Hold.OUTSIDE
+    return isinstance(shown, ModuleStatus) and shown.state is ModuleState.FAULT
+
+
 def ending(code: int) -> str:
     """Say how a process ended."""
     return f"exit status {code}" if code >= 0 else signal.Signals(-code).name
@@ -266,6 +292,19 @@ def ctrl_c_between_cycles() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
+def metadata(setup: Setup) -> dict[str, str]:
+    """Say what a recording is of."""
+    return {
+        "scenario": setup.scenario.id,
+        "seed": str(setup.seed),
+        "level": setup.level,
+        "plant": setup.plant,
+        "randomise": setup.randomise,
+        "site": setup.scenario.site,
+        "version": version(),
+    }
+
+
 class Observer(Protocol):
     """Looks on while a drive is under way: a live view."""
 
@@ -287,17 +326,8 @@ def drive(
     begin: called once the cart stands assembled, with its stores; may give somebody who looks on. Ctrl-C raises
     KeyboardInterrupt between two cycles, so that the recording is whole up to there.
     """
-    scenario = setup.scenario
-    metadata = {
-        "scenario": scenario.id,
-        "seed": str(setup.seed),
-        "level": setup.level,
-        "plant": setup.plant,
-        "site": scenario.site,
-        "version": version(),
-    }
     with ctrl_c_between_cycles() as pressed, Drive(setup) as run, ExitStack() as stack:
-        recorder = stack.enter_context(Recorder(recording, [run.cart, run.world], metadata))
+        recorder = stack.enter_context(Recorder(recording, [run.cart, run.world], metadata(setup)))
         observer = begin([run.cart, run.world]) if begin is not None else None
         begun_s = time.monotonic()
         gc.freeze()  # what the libraries made once is not looked through again and again,

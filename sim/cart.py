@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -18,7 +18,7 @@ from hal.signals import ActorsTruth, CartTruth, Clearance, FixQuality, LocalPlan
 from .actors import Actor
 from .compass_error import CompassError, CompassParams, declination_rad
 from .compiled import CompiledPlant
-from .gps_error import GPS_GRADES, GpsError
+from .gps_error import GPS_GRADES, GpsError, GpsGrade
 from .laser import PERIOD_NS as LASER_NS
 from .laser import Laser, LaserParams
 from .plant import CartParams, CartState, Demand, Plant, PythonPlant
@@ -47,6 +47,23 @@ PlantKind = Literal["compiled", "python"]
 PLANTS: dict[PlantKind, Callable[[CartParams], Plant]] = {"compiled": CompiledPlant, "python": PythonPlant}
 
 
+def scaled_grade(grade: GpsGrade, factor: float) -> GpsGrade:
+    """Give a class of fix with larger or smaller errors."""
+    return replace(grade, slow_sigma_m=grade.slow_sigma_m * factor, white_sigma_m=grade.white_sigma_m * factor)
+
+
+def scaled_compass(factor: float) -> CompassParams:
+    """Give the compass with larger or smaller errors."""
+    usual = CompassParams(cable_gap_m=CABLE_GAP_M)
+    return replace(
+        usual,
+        constant_max_rad=usual.constant_max_rad * factor,
+        one_cycle_max_rad=usual.one_cycle_max_rad * factor,
+        two_cycle_max_rad=usual.two_cycle_max_rad * factor,
+        noise_rad=usual.noise_rad * factor,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Outage:
     """The GPS receiver has no fix in [from_ns, to_ns)."""
@@ -68,7 +85,8 @@ class Start:
 class SimSetup:
     """What a simulated drive is made of.
 
-    plant: python is the readable form, ten times as slow, and equal but for the last bits of its sines; compass:
+    plant: python is the readable form, ten times as slow, and equal but for the last bits of its sines; gps_factor,
+    compass_factor: errors of the sensors over the usual ones; compass:
     personality of the device; None for none, as with `laser`.
     """
 
@@ -77,7 +95,10 @@ class SimSetup:
     t_ns: int
     level: Level = "wire"
     plant: PlantKind = "compiled"
+    params: CartParams = field(default_factory=CartParams)
     gps_grade: str = "sbas"
+    gps_factor: float = 1.0
+    compass_factor: float = 1.0
     outages: tuple[Outage, ...] = ()
     compass: str | None = "hmr3000"
     laser: LaserParams | None = None
@@ -87,10 +108,15 @@ class SimSetup:
 class SimCart:
     """A cart on a site. `rng(name)` gives the random generator of one named sensor."""
 
-    def __init__(self, setup: SimSetup, rng: Callable[[str], np.random.Generator]) -> None:
+    def __init__(
+        self,
+        setup: SimSetup,
+        rng: Callable[[str], np.random.Generator],
+        make_world: Callable[[Scene], World] | None = None,
+    ) -> None:
         self.setup = setup
         self.bus = CanBus(setup.level)
-        params = CartParams()
+        params = setup.params
         self.plant: Plant = PLANTS[setup.plant](params)
         self.plant.reset(CartState(setup.start.x_m, setup.start.y_m, setup.start.yaw_rad))
         self.safety = SafetyNode(self.bus, setup.t_ns)
@@ -111,23 +137,28 @@ class SimCart:
             sentences=("GGA", "GST", "RMC"),
             variation_rad=self.declination_rad,
         )
-        self._gps_error = GpsError(rng("gps"), GPS_GRADES[setup.gps_grade])
+        self._gps_error = GpsError(rng("gps"), scaled_grade(GPS_GRADES[setup.gps_grade], setup.gps_factor))
         self.compass: Compass | None = None
         if setup.compass is not None:
             self.compass = Compass(personality=setup.compass, level=setup.level, t0_ns=setup.t_ns)  # type: ignore[arg-type]
-            self._compass_error = CompassError(rng("compass"), CompassParams(cable_gap_m=CABLE_GAP_M))
+            self._compass_error = CompassError(rng("compass"), scaled_compass(setup.compass_factor))
         boxes = setup.site.all_obstacles()
         heights = {k: self.terrain.height_m(box.east_m, box.north_m) for k, box in enumerate(boxes)}
         self.scene: Scene = scene_of(setup.site, heights)
-        self.world = World(self.scene) if boxes or setup.actors or setup.laser else None
+        self._owns_world = make_world is None
+        self.world = (make_world or World)(self.scene) if boxes or setup.actors or setup.laser else None
         self._laser = Laser(self.world, setup.laser, rng("laser")) if self.world and setup.laser else None
-        for actor in setup.actors:
-            assert self.world is not None
-            self.world.add_actor(actor.kind)
+        self.add_actors()
         self._demand = Demand(brake=PARK_EFFORT)
         self._nearest, self._far = Clearance(), False
         self.t_ns = setup.t_ns
         self.estop_button = False
+
+    def add_actors(self) -> None:
+        """Put the actors into the world."""
+        for actor in self.setup.actors:
+            assert self.world is not None
+            self.world.add_actor(actor.kind)
 
     def advance(self, tick_ns: int) -> None:
         """Advance by one tick: physics under the present demand, then sensors and nodes at the new time."""
@@ -226,6 +257,16 @@ class SimCart:
             s.ax_mps2, s.ay_mps2, s.steer_rad, s.brake, s.distance_m,
         )  # fmt: skip
 
+    @property
+    def collided(self) -> bool:
+        """Whether the cart has touched anything."""
+        return self._nearest.collided
+
+    @property
+    def nearest_m(self) -> float:
+        """Distance to the nearest thing at the last look, at most 5."""
+        return self._nearest.distance_m
+
     def actors(self) -> ActorsTruth:
         """Where the actors are."""
         at = [actor.at(self.t_ns) for actor in self.setup.actors]
@@ -239,5 +280,5 @@ class SimCart:
 
     def close(self) -> None:
         """Give the world back."""
-        if self.world is not None:
+        if self.world is not None and self._owns_world:
             self.world.close()

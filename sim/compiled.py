@@ -69,6 +69,16 @@ class CompiledPlant:
             )
         self._put(snapshot.state, snapshot.pending)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        return _again, (self.params, self.dt_s, self.snapshot())
+
     def _put(self, state: CartState, pending: tuple[Demand, ...]) -> None:
         self._state = None
         self._core.put(0, msgspec.structs.astuple(state), tuple(msgspec.structs.astuple(demand) for demand in pending))
+
+
+def _again(params: CartParams, dt_s: float, snapshot: PlantSnapshot) -> CompiledPlant:
+    """Make the plant of a pickle."""
+    plant = CompiledPlant(params, dt_s)
+    plant.restore(snapshot)
+    return plant

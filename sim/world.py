@@ -57,6 +57,20 @@ class World:
         )
         return self._body(int(shape))
 
+    def furnish(self, scene: Scene) -> None:
+        """Put up another scene; actors go. The cart has touched nothing yet."""
+        b = self._bullet
+        if scene != self._scene:
+            for body in self._statics:
+                b.removeBody(body, physicsClientId=self._client)
+            self._scene = scene
+            n = len(scene.kind)
+            self._statics = [self._compound(range(k, min(k + COMPOUND, n))) for k in range(0, n, COMPOUND)]
+        for body, _ in self._actors:
+            b.removeBody(body, physicsClientId=self._client)
+        self._actors.clear()
+        self._collided = False
+
     def add_actor(self, kind: ObstacleKind) -> int:
         """Add a person; `move_actor` says where it is."""
         b = self._bullet
