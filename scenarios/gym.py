@@ -172,10 +172,9 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         image = self._warm.get(seed) if not self._recording else None
         if image is not None:
             self._warm.move_to_end(seed)
-            self._drive = image.restore()
+            self._drive, self._referee = image.drive, image.restore()
         else:
             self._drive = self._cold(seed)
-        self._referee = self._make_referee(self._drive)
 
     @property
     def _recording(self) -> bool:
@@ -202,8 +201,9 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         except BaseException:
             drive.close()
             raise
+        self._referee = self._make_referee(drive)
         if not self._recording:
-            self._warm[seed] = Image(drive)
+            self._warm[seed] = Image(drive, self._referee)
         return drive
 
     def setup_of(self, seed: int, stack: Stack) -> Setup:

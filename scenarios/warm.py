@@ -21,11 +21,13 @@ from sim.plant import CartParams
 from sim.terrain import Terrain
 from sim.world import World
 
+from .cart import CartSetup
 from .run import Drive
 from .scenario import Scenario
 
 KEPT = (
     CartParams,
+    CartSetup,
     Component,
     InputPort,
     LocalPlane,
@@ -77,15 +79,18 @@ class _Unpickler(pickle.Unpickler):
 
 
 class Image:
-    """A drive at one moment. It must run its modules in its own process, and have no hand at the keyboard."""
+    """A drive at one moment. It must run its modules in its own process, and have no hand at the keyboard.
 
-    def __init__(self, drive: Drive) -> None:
+    beside: something that refers to the drive's parts and is to come back with them.
+    """
+
+    def __init__(self, drive: Drive, beside: object = None) -> None:
         assert drive.simulated is not None
         self.drive = drive
         self._cart, self._world = drive.cart.save(), drive.world.save()
         file = io.BytesIO()
         pickler = _Pickler(file)
-        pickler.dump((drive.simulated, drive._hosts, drive.agent, drive._ended_s))
+        pickler.dump((drive.simulated, drive._hosts, drive.agent, drive._ended_s, beside))
         self._graph, self._kept = file.getvalue(), pickler.kept
 
     @property
@@ -93,17 +98,17 @@ class Image:
         """Bytes that the image takes."""
         return len(self._cart) + len(self._world) + len(self._graph)
 
-    def restore(self) -> Drive:
-        """Make the drive what it was."""
+    def restore(self) -> Any:
+        """Make the drive what it was; returns what was beside it."""
         drive = self.drive
         drive.cart.restore(self._cart)
         drive.world.restore(self._world)
         graph = _Unpickler(self._graph, self._kept).load()
-        drive.simulated, drive._hosts, drive.agent, drive._ended_s = graph
+        drive.simulated, drive._hosts, drive.agent, drive._ended_s, beside = graph
         assert drive.simulated is not None
         if drive.simulated.sim.world is not None:  # one world for all drives of an environment
             drive.simulated.sim.world.furnish(drive.simulated.sim.scene)
             drive.simulated.sim.add_actors()
         drive.sim, drive.hal = drive.simulated.sim, drive.simulated.hal
         drive._list_work()
-        return drive
+        return beside
