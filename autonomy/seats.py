@@ -45,6 +45,7 @@ class Seat(Module):
     sees: ClassVar[tuple[Feature, ...]] = ()
     n_actions: ClassVar[int] = 2
     drives: ClassVar[bool] = True  # commands the cart, and waits until it may
+    _estimate: Pose | None = None
 
     site = Input(Site, static=True, pointer="mission/site")
     course = Input(Course, static=True, pointer="mission/course")
@@ -98,6 +99,11 @@ class Seat(Module):
                 self.ready = (enabled or not self.drives) and self.gps is not None and self.gps.mode >= 2
             self._looked = self.t_ns, self.see()
         return self._looked[1]
+
+    @property
+    def estimate(self) -> Pose | None:
+        """The pose that it said last, if that is its task."""
+        return self._estimate
 
     def place(self) -> tuple[float, float, float]:
         """Give (x_m, y_m, yaw_rad) of C in M, as this seat knows it: by the wheels, from the start mark."""
@@ -248,7 +254,7 @@ class LocaliseSeat(Seat):
         sample = self.samples.get("gps")
         fixed = self.gps is not None and self.gps.mode >= 2 and sample is not None
         age_s = (self.t_ns - sample.t_data_ns) * 1e-9 if fixed and sample is not None else 1e3
-        self.pose = Pose(
+        self._estimate = self.pose = Pose(
             x_m=self._x_m,
             y_m=self._y_m,
             yaw_rad=self._yaw_rad,

@@ -23,7 +23,6 @@ from autonomy.loading import make_module
 from autonomy.seats import SEATS, Seat
 from autonomy.wiring import Stack, stack_with
 from hal.bus import Level
-from hal.signals import Pose
 from hal.signals import Site as SiteRecord
 from rtdb import HOST_DEPENDENT, Writer
 from rtdb.recorder import Recorder
@@ -152,7 +151,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         from .picture import picture
 
         drive, _ = self._running()
-        return picture(drive.sim, self._referee.line)
+        return picture(drive.sim, self.referee.line)
 
     def close(self) -> None:
         """Give everything back."""
@@ -172,7 +171,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         image = self._warm.get(seed) if not self._recording else None
         if image is not None:
             self._warm.move_to_end(seed)
-            self._drive, self._referee = image.drive, image.restore()
+            self._drive, self.referee = image.drive, image.restore()
         else:
             self._drive = self._cold(seed)
 
@@ -201,9 +200,9 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         except BaseException:
             drive.close()
             raise
-        self._referee = self._make_referee(drive)
+        self.referee = self._make_referee(drive)
         if not self._recording:
-            self._warm[seed] = Image(drive, self._referee)
+            self._warm[seed] = Image(drive, self.referee)
         return drive
 
     def setup_of(self, seed: int, stack: Stack) -> Setup:
@@ -240,8 +239,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         return Referee(drive.sim, site.value, drive.simulated.course, OFF_COURSE_M.get(self.agent, 3.0))
 
     def _judge(self, drive: Drive, seat: Seat) -> tuple[Reward, End]:
-        pose = drive.agent.module._out.get(type(seat).outputs["pose"]) if self.agent == "localise" else None  # type: ignore[union-attr]
-        reward, end = self._referee.judge(self.dt_s, seat.action[-1], pose if isinstance(pose, Pose) else None)
+        reward, end = self.referee.judge(self.dt_s, seat.action[-1], seat.estimate)
         if self._recorder is not None:
             self._reward.write(reward, drive.world.now_ns)
         return reward, end
@@ -250,7 +248,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         _, seat = self._running()
         numbers = list(seat.look())
         if self.tier == "truth":
-            numbers += self._referee.truth()
+            numbers += self.referee.truth()
         if self._flat is not None:
             return self._flat(numbers)
         out, at = {}, 0
@@ -267,7 +265,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
             "time_s": self._drive.time_s,
             "reward_terms": {name: getattr(reward, name) for name in TERMS},
             "end": str(end),
-            "arrived": self._referee.arrived,
+            "arrived": self.referee.arrived,
         }
 
     def forget(self) -> None:
