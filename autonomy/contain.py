@@ -30,7 +30,9 @@ class Watch:
     """
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()  # so that nothing is raised behind the step that it is meant for
         self._now: tuple[int, float] | None = None  # a new object for each step
+        self._raised = False
         self._thread: threading.Thread | None = None
         self._ident = 0
 
@@ -43,7 +45,11 @@ class Watch:
 
     def end(self) -> None:
         """Note that it has ended."""
-        self._now = None
+        with self._lock:
+            self._now, raised = None, self._raised
+            self._raised = False
+        if raised:
+            _raise_in(threading.get_ident(), None)  # it ended by itself meanwhile: take back what has not arrived yet
 
     def _look(self) -> None:
         seen: tuple[int, float] | None = None
@@ -58,7 +64,10 @@ class Watch:
             if now is not seen:
                 seen, cpu_s, wall_s = now, used_s, time.monotonic()
             elif used_s - cpu_s > now[1] or time.monotonic() - wall_s > HANG_WALL_S:
-                _raise_in(now[0])
+                with self._lock:
+                    if self._now is now:
+                        self._raised = True
+                        _raise_in(now[0], StepHung)
                 cpu_s, wall_s = used_s, time.monotonic()
 
 
@@ -69,8 +78,10 @@ def _cpu_s(ident: int) -> float:
         return 0.0
 
 
-def _raise_in(ident: int) -> None:
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), ctypes.py_object(StepHung))
+def _raise_in(ident: int, error: type[BaseException] | None) -> None:
+    """Have an exception raised in a thread, or take back one that was not raised yet."""
+    what = ctypes.py_object(error) if error is not None else None
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), what)
 
 
 class Prints:

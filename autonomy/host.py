@@ -10,12 +10,13 @@ the next due tick or says what is wrong with it); `show` (what the module shows)
 """
 
 import logging
+import math
 import sys
 import time
 import traceback
 import zlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,8 +70,9 @@ class Host:
         self.wire, self.seed, self._faults = wire, seed, faults
         self.module: Module = make_module(wire)
         cls = type(self.module)
+        due = math.gcd(wire.every, wire.latency_cycles)  # whoever waits for it waits for what it commits later, too
         self.component: Component = store.join(
-            wire.component, participant=participant, every=wire.every, phase=wire.phase
+            wire.component, participant=participant, every=due, phase=wire.phase % due
         )
         self._store, self._real = store, participant and store.clock.kind is Kind.REAL
         edge: dict[str, Any] = {"every": wire.every, "history_s": HISTORY_S}
@@ -84,7 +86,7 @@ class Host:
         few: dict[str, Any] = {"history_s": 0.1}
         self._show: Writer[Any] = self.component.insert("show", json_schema(SHOW_BYTES), **(edge | few))
         self._config: Writer[Any] = self.component.insert(
-            "config", json_schema(CONFIG_BYTES), flags=Flag.PUBLIC_WRITE, **few
+            "config", json_schema(CONFIG_BYTES), flags=Flag.PUBLIC_WRITE | HOST_DEPENDENT, **few
         )
         self._configured = self._config.write(wire.entry(), store.now_ns)
         self._timing = (
@@ -99,7 +101,8 @@ class Host:
         self._inputs: list[tuple[str, InputPort[Any], Link | None, int]] = []
         self._state, self._reason = ModuleState.WAITING, ""
         self._steps = self._missed = 0
-        self.module.rng = seeded(seed, wire.component)
+        self.module.rng = self._rng = seeded(seed, wire.component)
+        self.rng_before: Mapping[str, Any] | None = None  # state of the generator before the step, for a repro
         self.module.dt_s = wire.every * store.tick_ns * 1e-9
         self._last: dict[str, tuple[int, Any]] = {}  # write number and value of each input
         self._pending: deque[Result] = deque()
@@ -123,6 +126,13 @@ class Host:
         """Find the objects that the inputs point at."""
         self._inputs = self._links(self.wire, timeout_s)
 
+    def prepare(self) -> None:
+        """Call the module's `reset` before the first cycle: what it loads then costs no cycle."""
+        if not self._started:
+            self._started, self._cycle, self._now_ns = True, self._store.cycle, self._store.now_ns
+            self.module.t_ns = self._now_ns
+            self._guarded(self.module.reset)
+
     def _links(self, wire: Wire, timeout_s: float) -> list[tuple[str, InputPort[Any], Link | None, int]]:
         out: list[tuple[str, InputPort[Any], Link | None, int]] = []
         pointers = inputs_of(type(self.module), wire.inputs)
@@ -141,13 +151,15 @@ class Host:
 
     def step(self, cycle: int, _t_ns: int = 0) -> None:
         """Run the module if it is due in this cycle."""
-        if self._pending and self._pending[0].cycle <= cycle:
-            self._commit(self._pending.popleft())
-        if cycle % self.wire.every == self.wire.phase and self.begin(cycle):
+        if self.begin(cycle):
             self.finish()
 
     def begin(self, cycle: int) -> bool:
-        """Put the inputs of a due cycle into the module; False if it cannot be called in this cycle."""
+        """Put the inputs of this cycle into the module; False if it is not due, or cannot be called."""
+        if self._pending and self._pending[0].cycle <= cycle:
+            self._commit(self._pending.popleft())
+        if cycle % self.wire.every != self.wire.phase:
+            return False
         self._cycle = cycle
         now_ns = self._now_ns = self._store.core.now_ns
         if self._state is ModuleState.FAULT:
@@ -170,7 +182,9 @@ class Host:
     def finish(self) -> None:
         """Call the step, and commit what it gave."""
         module = self.module
-        before = dict(module.__dict__) if self._faults is not None else {}
+        before: dict[str, Any] = {}
+        if self._faults is not None:
+            before, self.rng_before = dict(module.__dict__), self._rng.bit_generator.state
         names = len(module.__dict__)
         module._out.clear()
         begun_s = time.perf_counter() if self._timing is not None else 0.0
@@ -181,7 +195,7 @@ class Host:
         late_ns = self._store.core.now_ns - module.t_ns - self._deadline_ns if self._real else 0
         try:
             if len(module.__dict__) != names:
-                self._check_names()
+                check_names(module)
             payloads = self._payloads()
         except Exception as error:  # a value may be anything
             self._fail(error, before)
@@ -211,7 +225,10 @@ class Host:
                 call()
             finally:
                 watch.end()
-        except (Exception, SystemExit, StepHung) as error:  # a module may raise anything; it must not harm others
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # a module may raise anything; it must not harm others
+            watch.end()  # again: the first one may have been cut short
             sys.stdout, sys.stderr = streams
             self._fail(error, before or {})
             return False
@@ -255,16 +272,6 @@ class Host:
             values[name] = None
         return ""
 
-    def _check_names(self) -> None:
-        """Refuse a record under a name that is no port: an output with a spelling mistake."""
-        module = self.module
-        for name, value in module.__dict__.items():
-            if isinstance(value, Record) and name not in module.inputs and not name.startswith("_"):
-                raise ModuleError(
-                    f"self.{name} is not an output; {type(module).__name__} declares "
-                    f"{', '.join(module.outputs)} (start names of your own records with _)"
-                )
-
     def _payloads(self) -> list[bytes]:
         """Give the payload of each output, or raise what is wrong with them."""
         module, payloads = self.module, []
@@ -298,24 +305,39 @@ class Host:
 
     def _fail(self, error: BaseException, before: dict[str, Any]) -> None:
         """Stop the module for good."""
-        reason = (
-            f"the step did not end within {self._hang_s:g} s of CPU time, or {HANG_WALL_S:g} s"
-            if isinstance(error, StepHung)
-            else str(error)
-        )
         name, cycle = self.wire.component, self._cycle
-        log.warning("%s stopped at cycle %d: %s: %s", name, cycle, type(error).__name__, reason)
-        log.debug("traceback", exc_info=error)
-        if self._faults is not None:
-            from .repro import save
-
-            file = save(self._faults, self, before, error)
-            log.warning("fairway repro %s runs just this step again", file)
-        self._say(ModuleState.FAULT, f"cycle {cycle}: {type(error).__name__}: {reason}{_where(error)}")
-        if isinstance(error, MemoryError):
-            self.module.__dict__.clear()  # what it has gathered
+        reason = self._reason_of(error)
+        self._say(ModuleState.FAULT, f"cycle {cycle}: {reason}{_where(error, type(self.module))}")
         self._pending.clear()
         self._miss(self._now_ns)
+        log.warning("%s stopped at cycle %d: %s", name, cycle, reason)
+        log.debug("traceback", exc_info=error)
+        if self._faults is not None:
+            self._keep(self._faults, before, error)
+        if isinstance(error, MemoryError):
+            traceback.clear_frames(error.__traceback__)
+            self.module.__dict__.clear()  # what it has gathered
+
+    def _reason_of(self, error: BaseException) -> str:
+        if isinstance(error, StepHung):
+            what = f"the step did not end within {self._hang_s:g} s of CPU time, or {HANG_WALL_S:g} s"
+        elif isinstance(error, MemoryError) and not error.args:
+            what = "there is no memory left for it; memory_mb in the wiring says how much it may take"
+        else:
+            try:
+                what = " ".join(str(error).split())
+            except Exception:  # its own class of errors, with mistakes of its own
+                what = "it cannot say what"
+        return f"{type(error).__name__}: {what}" if what else type(error).__name__
+
+    def _keep(self, folder: Path, before: dict[str, Any], error: BaseException) -> None:
+        """Save the step that broke; what goes wrong with that harms nobody."""
+        try:
+            from .repro import save
+
+            log.info("fairway repro %s runs just this step again", save(folder, self, before, error))
+        except Exception as problem:  # a full disk; memory() and pickling are the module's own code
+            log.warning("the step that broke %s is not saved: %s", self.wire.component, type(problem).__name__)
 
     def _miss(self, now_ns: int) -> None:
         """Hold the outputs for a while, then write the safe ones."""
@@ -346,6 +368,7 @@ class Host:
             links = self._links(wire, 0.0)
         except (ModuleError, RtdbError) as error:
             log.warning("%s keeps its wiring: %s", name, error)
+            self._configured = self._config.write(self.wire.entry(), self._store.now_ns)  # what is in force
             self._status.write(self._told(f"wiring refused: {error}"))
             return
         self.wire, self._inputs = wire, links
@@ -380,6 +403,16 @@ class Host:
         self._timing.write(self._took, self._now_ns)
 
 
+def check_names(module: Module) -> None:
+    """Refuse a record under a name that is no port: an output with a spelling mistake."""
+    for name, value in module.__dict__.items():
+        if isinstance(value, Record) and name not in module.inputs and not name.startswith("_"):
+            raise ModuleError(
+                f"self.{name} is not an output; {type(module).__name__} declares "
+                f"{', '.join(module.outputs)} (start names of your own records with _)"
+            )
+
+
 def narrowed(cls: type[Record], ranges: Ranges) -> Any:
     """Give a record's schema with the ranges of a port: for readers, who find them in the store."""
     from rtdb import Schema
@@ -394,10 +427,13 @@ def narrowed(cls: type[Record], ranges: Ranges) -> Any:
     return Schema(wide.name, wide.doc, fields, cls)
 
 
-def _where(error: BaseException) -> str:
-    """Name file and line of the innermost frame that is not ours: where a student looks first."""
-    at = ""
-    for frame in traceback.extract_tb(error.__traceback__):
-        if Path(frame.filename).parent != OWN_FILES[0] or Path(frame.filename).name not in OWN_FILES[1]:
-            at = f" ({Path(frame.filename).name}:{frame.lineno})"
+def _where(error: BaseException, cls: type[Module]) -> str:
+    """Name file and line where a student looks first: the innermost in the module's own file, else not in ours."""
+    at, own = "", getattr(sys.modules.get(cls.__module__), "__file__", None)
+    inside = False
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file = Path(frame.f_code.co_filename)
+        mine = frame.f_code.co_filename == own
+        if (mine or not inside) and (file.parent != OWN_FILES[0] or file.name not in OWN_FILES[1]):
+            at, inside = f" ({file.name}:{line})", inside or mine
     return at

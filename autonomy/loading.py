@@ -2,11 +2,13 @@
 
 import importlib
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .module import Module, ModuleError
+from .ranges import sound, what_is_wrong
 
 if TYPE_CHECKING:
     from .wiring import Wire
@@ -43,7 +45,8 @@ def _from_file(path: Path) -> Any:
         raise ModuleError(f"no file {path}; --use takes COMPONENT=FILE.py:Class")
     name = f"fairway_student_{path.stem}"
     known = sys.modules.get(name)
-    if known is not None and (known.__file__, getattr(known, "fairway_mtime_ns", 0)) == (str(path), _mtime_ns(path)):
+    place = os.path.abspath(path)  # as the import system writes it
+    if known is not None and (known.__file__, getattr(known, "fairway_mtime_ns", 0)) == (place, _mtime_ns(path)):
         return known  # the same file: one class, however often it is loaded
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -73,7 +76,17 @@ def make_module(wire: "Wire") -> Module:
         raise ModuleError(f"{component}: {spec}: {type(error).__name__}: {error}") from error
     module.__dict__.update(checked_params(component, cls, wire.params))
     check_inputs(component, cls, wire.inputs)
+    _check_safe_values(component, cls)
     return module
+
+
+def _check_safe_values(component: str, cls: type[Module]) -> None:
+    """Refuse safe values that the module itself would not be allowed to give."""
+    for name, port in cls.outputs.items():
+        if type(port.safe) is not port.cls:
+            raise ModuleError(f"{component}: the safe value of {name} is a {port.cls.__name__}, got {port.safe!r:.60}")
+        if not sound(port.cls, port.ranges)(port.safe):
+            raise ModuleError(f"{component}: the safe value of {name} {what_is_wrong(port.safe, port.ranges)}")
 
 
 def checked_params(component: str, cls: type[Module], params: dict[str, Any]) -> dict[str, Any]:

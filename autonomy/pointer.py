@@ -104,15 +104,24 @@ def field_at(schema: Schema, path: str) -> Spec:
     """Give the declaration of the number at a JSON Pointer into a record; ModuleError where there is none."""
     fields: dict[str, Field] = {f.name: f for f in schema.fields}
     found: Field | None = None
+    many = False  # the next token counts the elements of a list
     for token in path.split("/")[1:]:
-        if found is not None and found.spec.shape != "one" and token.isdigit():
+        if many:
+            assert found is not None
+            if not token.isdigit() or (found.spec.shape == "array" and int(token) >= found.spec.n):
+                raise ModuleError(f"{schema.name} has no {path}: {found.name} is a list of {found.spec.n}, from 0 on")
+            many = False
             continue
         found = fields.get(token)
         if found is None:
-            raise ModuleError(f"{schema.name} has no {path}; there is {', '.join('/' + name for name in fields)}")
+            there = ", ".join("/" + name for name in fields) or "nothing below that"
+            raise ModuleError(f"{schema.name} has no {path}; there is {there}")
         fields = {f.name: f for f in found.record.fields} if found.spec.kind == "record" else {}
+        many = found.spec.shape != "one"
     if found is None or found.spec.kind in NO_NUMBERS:
         raise ModuleError(f"{path or 'the whole object'} is no number; point at one: #/FIELD")
+    if many:
+        raise ModuleError(f"{path} is a list of {found.spec.n}; point at one number: {path}/0")
     return found.spec
 
 
@@ -134,6 +143,8 @@ def _record_of_json(cls: type[Record], ranges: Ranges) -> Callable[[Sample[Any]]
                         sample.value, f"/{f.name}", f.spec.unit or "1", low=low, high=high,
                         unit_in_wiring=f.spec.unit or "1",
                     )  # fmt: skip
+                    if f.spec.kind not in ("f8", "f4") and not number.is_integer():
+                        raise Unusable(f"/{f.name}: a whole number is expected, got {number!r}")
                     numbers[f.name] = number if f.spec.kind in ("f8", "f4") else int(number)
         except RecordError as error:
             raise Unusable(str(error)) from error

@@ -1,8 +1,8 @@
 """Repro: the step that broke a module, in a file, to be run again under a debugger.
 
 The file is JSON: the wiring, the cycle, the inputs as the module read them (with their schemas), why it broke, and what
-the module remembered before that step (pickled; what cannot be pickled is named). Attributes that the step assigned
-anew are as before it; what it changed in place (a list, an array) is as the failing step left it.
+the module remembered before that step (pickled; what cannot be pickled is named). Randomness and what
+the step assigned anew are as before it; what it changed in place (a list, an array) is as the failing step left it.
 """
 
 import base64
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from rtdb import Object, Record, Sample
+from rtdb import Object, Record, RtdbError, Sample
 from rtdb.records import Schema
 
 from .loading import make_module
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 SUFFIX = ".repro"
+MOST_BYTES = 16 << 20  # of one attribute, pickled
 
 
 def save(folder: Path, host: "Host", before: dict[str, Any], error: BaseException) -> Path:
@@ -33,14 +34,18 @@ def save(folder: Path, host: "Host", before: dict[str, Any], error: BaseExceptio
     module, wire = host.module, host.wire
     now = module.__dict__
     module.__dict__ = {**before}
-    state, left_out = _pickled(module.memory() if before else {})
-    module.__dict__ = now
+    try:
+        state, left_out = _pickled(module.memory() if before else {})
+    finally:
+        module.__dict__ = now
     document = {
         "fairway": "repro",
         "format": FORMAT,
         "component": wire.component,
         "wire": wire.entry() | {"module": _absolute(wire.module)},
         "seed": host.seed,
+        "call": "step" if before else "reset",
+        "rng": host.rng_before,
         "t_ns": module.t_ns,
         "dt_s": module.dt_s,
         "inputs": {name: _input(sample, module, name) for name, sample in module.samples.items()},
@@ -78,8 +83,12 @@ def _pickled(state: dict[str, Any]) -> tuple[str, list[str]]:
     kept, left_out = {}, []
     for name, value in state.items():
         try:
-            kept[name] = pickle.dumps(value)
+            data = pickle.dumps(value)
         except Exception:  # locks, files, lambdas: anything
+            data = b""
+        if 0 < len(data) <= MOST_BYTES:
+            kept[name] = data
+        else:
             left_out.append(name)
     return base64.b64encode(pickle.dumps(kept)).decode(), left_out
 
@@ -89,9 +98,17 @@ def load(path: Path) -> tuple[Module, dict[str, Any]]:
     try:
         document = json.loads(path.read_text())
         if document["fairway"] != "repro" or document["format"] != FORMAT:
-            raise KeyError("fairway")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ModuleError(f"{path} is no repro of this version: {error}") from error
+            raise ValueError("its format is another one")
+        return _module_of(path, document), document
+    except OSError as error:
+        raise ModuleError(f"{path}: {error.strerror}") from error
+    except (ModuleError, RtdbError):  # the module has changed meanwhile
+        raise
+    except Exception as error:  # JSON, pickles, and restore() of the module
+        raise ModuleError(f"{path} is no repro of this version: {type(error).__name__}: {error}") from error
+
+
+def _module_of(path: Path, document: dict[str, Any]) -> Module:
     wire = wire_of(str(path), document["component"], document["wire"])
     module = make_module(wire)
     from .host import seeded
@@ -100,14 +117,17 @@ def load(path: Path) -> tuple[Module, dict[str, Any]]:
     module.t_ns, module.dt_s = document["t_ns"], document["dt_s"]
     state = pickle.loads(base64.b64decode(document["state"]))
     module.restore({name: pickle.loads(value) for name, value in state.items()})
+    if document["rng"] is not None and hasattr(module.rng, "bit_generator"):
+        module.rng.bit_generator.state = document["rng"]
     ports = type(module).inputs
     for name, port in ports.items():
         module.__dict__[name] = None
         if name in document["inputs"]:
             raw = document["inputs"][name]
-            module.__dict__[name] = _value(raw, port.cls)
-            module.samples[name] = Sample(module.__dict__[name], raw["write"], raw["t_commit_ns"], raw["t_data_ns"], ())
-    return module, document
+            value = module.__dict__[name] = _value(raw, port.cls)
+            stamps = raw["write"], raw["t_commit_ns"], raw["t_data_ns"]
+            module.samples[name] = Sample(raw.get("json", value), *stamps, ())
+    return module
 
 
 def _value(raw: dict[str, Any], cls: type) -> Any:

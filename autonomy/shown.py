@@ -11,25 +11,36 @@ def shown(values: dict[str, Any], n_bytes: int) -> dict[str, Any]:
     Lists of pairs are points in M.
     """
     out: dict[str, Any] = {}
-    left = n_bytes - 40
+    left = n_bytes - 160  # for the name of what is left out, however its letters are written
     for name, value in values.items():
-        plain = _plain(value, 3)
-        size = len(json.dumps({str(name): plain}, ensure_ascii=False).encode())
+        key = _text(name) if isinstance(name, str) else f"{type(name).__name__} {len(out)}"
+        try:
+            plain = _plain(value, 3)
+        except Exception as error:  # __repr__, tolist: the module's own code
+            plain = f"cannot be shown: {type(error).__name__}"
+        size = len(json.dumps({key: plain}, ensure_ascii=False).encode())
         if size > left:
-            out["left_out"] = str(name)[:20]
+            out["left_out"] = key.encode("ascii", "replace").decode()[:20]
             continue
-        out[str(name)] = plain
+        out[key] = plain
         left -= size
     return out
+
+
+def _text(text: str) -> str:
+    """Give a text that UTF-8 can say."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def _plain(value: Any, depth: int) -> Any:
     if hasattr(value, "tolist"):  # numpy
         value = value.tolist()
-    if value is None or isinstance(value, bool | str | int):
-        return value if not isinstance(value, int) or abs(value) < 1 << 53 else str(value)
+    if isinstance(value, str):
+        return _text(value)
+    if value is None or isinstance(value, bool | int):
+        return value if value is None or abs(value) < 1 << 53 else str(value)
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     if isinstance(value, list | tuple) and depth:
         return [_plain(item, depth - 1) for item in value]
-    return f"{value!r:.200}"
+    return _text(f"{value!r:.200}")

@@ -42,12 +42,12 @@ class Wire:
     params: dict[str, Any] = field(default_factory=dict)
     latency_cycles: int = 0
     budget_ms: float | None = None
-    memory_mb: int | None = None
+    memory_mb: float | None = None
 
     def entry(self) -> dict[str, Any]:
         """Give the entry of a stack file that says the same."""
         said = {key: getattr(self, key) for key in KEYS}
-        return {key: value for key, value in said.items() if key in KEYS[:4] or value not in ({}, None, 0)}
+        return {key: value for key, value in said.items() if key in KEYS[:5] or value not in (None, 0)}
 
     def objects(self) -> dict[str, str]:
         """Give the name of the object behind each wired input."""

@@ -1,16 +1,19 @@
 """The `fairway` command. Every import that costs time stands inside a command's body."""
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from autonomy.cli import register as register_modules
 from rtdb.cli import app as db_app
 
 from .cli_regression import register as register_regression
+from .cli_running import register as register_running
+from .folder import Interrupted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,10 +27,6 @@ if TYPE_CHECKING:
 PASS, FAIL, BAD_INPUT, BROKEN, INTERRUPTED = 0, 1, 2, 3, 130
 
 
-class Interrupted(Exception):
-    """Ctrl-C during a drive; the message says what is kept of it."""
-
-
 app = typer.Typer(
     help="Fairway: drive a simulated golf cart, look at it, judge it.",
     no_args_is_help=True,
@@ -38,6 +37,8 @@ hal_app = typer.Typer(help="Devices and captures.", no_args_is_help=True)
 app.add_typer(db_app, name="db")
 app.add_typer(hal_app, name="hal")
 register_regression(app)
+register_running(app)
+register_modules(app)
 
 
 @app.command()
@@ -48,6 +49,9 @@ def drive(
     seed: Annotated[int, typer.Option(help="Seed of all randomness.", min=0)] = 0,
     level: Annotated[str, typer.Option(help="direct (messages) or wire (true bytes).")] = "wire",
     plant: Annotated[str, typer.Option(help="compiled, or python: the readable form, for reading along.")] = "compiled",
+    randomise: Annotated[
+        str, typer.Option(help="none, mild or wide: friction, load, lags, sensor errors from the seed.")
+    ] = "none",
     out: Annotated[Path, typer.Option(help="Folder for runs.")] = Path("runs"),
     use: Annotated[
         list[str] | None, typer.Option(help="COMPONENT=FILE.py:Class swaps one module of the stack.")
@@ -74,6 +78,7 @@ def drive(
     from autonomy.wiring import stack_with
 
     from .cli_regression import after_drive
+    from .randomise import KINDS
     from .report import show
     from .run import Setup
     from .scenario import load_scenario
@@ -82,6 +87,8 @@ def drive(
         raise typer.BadParameter(f"{level!r} is not one of direct, wire", param_hint="--level")
     if plant not in ("compiled", "python"):
         raise typer.BadParameter(f"{plant!r} is not one of compiled, python", param_hint="--plant")
+    if randomise not in KINDS:
+        raise typer.BadParameter(f"{randomise!r} is not one of {', '.join(KINDS)}", param_hint="--randomise")
     if by_hand and not sys.stdin.isatty():
         raise typer.BadParameter("the keyboard is needed: standard input is not a terminal", param_hint="--by-hand")
     plan = load_scenario(scenario)
@@ -89,8 +96,8 @@ def drive(
     folder = out / plan.id / str(seed)
     folder.mkdir(parents=True, exist_ok=True)
     setup = Setup(
-        scenario=plan, seed=seed, level=level, plant=plant, stack=stack, db=db,  # type: ignore[arg-type]
-        by_hand=by_hand, shuffle=shuffle,
+        scenario=plan, seed=seed, stack=stack, db=db, by_hand=by_hand, shuffle=shuffle, faults=folder,
+        level=level, plant=plant, randomise=randomise,  # type: ignore[arg-type]
     )  # fmt: skip
     console = Console()
     if by_hand:
@@ -100,6 +107,8 @@ def drive(
         pace = 1.0
     result = _drive(setup, folder, pace or (4.0 if view else None), console, view)
     show(console, result)
+    for kept in sorted(folder.glob("*.repro")):
+        console.print(f"fairway repro {kept}  runs just the step that broke again", highlight=False, soft_wrap=True)
     after_drive(console, folder, scenario, seed)
     raise typer.Exit({"PASS": PASS, "FAIL": FAIL, "UNKNOWN": FAIL}.get(result.verdict, BROKEN))
 
@@ -107,17 +116,17 @@ def drive(
 def _drive(setup: "Setup", folder: Path, pace: float | None, console: "Console", view: bool) -> "Result":
     from rtdb.recording import Recording
 
+    from .folder import clear, locked
     from .judge import judge
     from .plots import write_plots
 
     recording = folder / "run.mcap"
     with ExitStack() as held:
         lives: list[LiveView] = []
-        held.enter_context(_locked(folder))
+        held.enter_context(locked(folder))
 
         def begin(stores: "list[Store]") -> "LiveView | None":
-            for old in (folder / "result.json", *folder.glob("*.png"), folder / "run.rrd"):
-                old.unlink(missing_ok=True)  # what was derived from an old recording must not stand beside a new one
+            clear(folder)
             if not view:
                 return None
             from .replay import LiveView
@@ -136,21 +145,6 @@ def _drive(setup: "Setup", folder: Path, pace: float | None, console: "Console",
             console.print(f"{result.verdict}: look around; close the viewer or press Ctrl-C to go on")
             live.viewer.wait()
     return result
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Keep a second drive out of the folder; the kernel gives the lock back, however this process ends."""
-    import fcntl
-
-    from rtdb.errors import InUse
-
-    with (folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InUse(f"another drive writes into {folder}; wait for it, or give another --out") from None
-        yield
 
 
 def _run_drive(

@@ -7,7 +7,7 @@ Reward of a step of dt seconds, in the order of `Reward`:
     steering    -0.1 |change of the steering action|
     jerk        -0.02 dt |change of acceleration| / dt, at most 10 m/s3
     estimate    -0.5 dt |error of the pose estimate|, for a localiser only
-    arrived     +10 once, at the end of the line
+    arrived     +10 once, within the last way-point's radius of the end of the line
     ended       -10 once, when the episode is terminated
 """
 
@@ -64,6 +64,9 @@ class Referee:
         self._accel_mps2 = 0.0
         self._steering = 0.0
         self.arrived = False
+        stations = self._line.stations  # who has a wrong pose stops a little before the end, or beyond it
+        near_m = stations[-1].s_m - course.radius_m[-1] if stations else 0.0
+        self._arrival = sum(station.s_m < near_m for station in stations)
         s = sim.plant.state
         self._line.move(s.x_m, s.y_m)
         self.aside_m, self.heading_rad, _ = self._line.aside(s.x_m, s.y_m, s.yaw_rad)
@@ -78,7 +81,7 @@ class Referee:
         self.aside_m, self.heading_rad, _ = self._line.aside(s.x_m, s.y_m, s.yaw_rad)
         end = self._end()
         jerk = min(abs(s.ax_mps2 - self._accel_mps2) / dt_s, 10.0)
-        arrived = self._line.finished and not self.arrived
+        arrived = self._line.at >= self._arrival and not self.arrived
         terms = (
             progress,
             -0.5 * dt_s * min(abs(self.aside_m), 3.0),

@@ -1,4 +1,4 @@
-"""Replay: a recording, or a drive under way, as rerun shows it. The only module that imports rerun.
+"""Replay: a recording, or a drive under way, as rerun shows it. Only this module and `shown` import rerun.
 
 A recording stays the record; the .rrd is derived from it, column by column, and can be thrown away. Both ways in, the
 finished recording and the running stores, become the same tables and go through the same builders:
@@ -11,7 +11,8 @@ Builders go by the name of the record, not of the topic, so a localiser under an
 number, flag, enum and text of every topic becomes a plot or a lane under its component, known here or not.
 
 What a colour means, everywhere: green is the truth, orange what the cart believes, blue what was wanted, cyan what a
-sensor said. Entities: `scene` (in M), `signals/<topic>/<field>`, `states/<topic>/<field>`, `summary`.
+sensor said. Entities: `scene` (in M), `signals/<topic>/<field>`, `states/<topic>/<field>`, `summary`, and
+`texts/<topic>/<name>`: what modules show themselves, see shown.py.
 """
 
 import contextlib
@@ -41,11 +42,13 @@ from rerun.urdf import UrdfTree
 
 from hal.signals import FixQuality, LocalPlane, ObstacleKind
 from rtdb import Store
+from rtdb.json_object import is_json
 from rtdb.recording import Channel, Recording
 from rtdb.records import Field, Schema
 
 from .judge import Result
 from .metrics import METRICS
+from .shown import ByModules
 
 URDF = Path(__file__).with_name("cart.urdf")
 TRAIL_S = 0.2  # length of one piece of a driven line
@@ -207,9 +210,15 @@ class _Shown:
     plots: dict[tuple[str, str], list[tuple[str, str, str]]] = field(default_factory=dict)  # topic, record: unit...
     lanes: dict[tuple[str, str], list[tuple[str, str]]] = field(default_factory=dict)  # topic, record: field, path
     trails: list[str] = field(default_factory=list)
+    texts: dict[str, list[str]] = field(default_factory=dict)  # component: paths
     cart: str = ""  # what the close view follows
     low: Any = None  # corners of the rectangle around course and driven lines
     high: Any = None
+
+    @property
+    def size(self) -> int:
+        """How much the blueprint has to show; changes when something comes."""
+        return len(self.plots) + len(self.lanes) + len(self.trails) + len(self.texts)
 
 
 class Builder:
@@ -218,6 +227,7 @@ class Builder:
     def __init__(self, stream: rr.RecordingStream, tick_ns: int, t0_ns: int) -> None:
         self._stream, self._tick_ns, self._t0_ns = stream, tick_ns, t0_ns
         self.shown = _Shown()
+        self._modules = ByModules(stream, self._index, self._plot, self.shown.texts)
         self._plane: LocalPlane | None = None
         self._waypoints: list[tuple[float, float, float]] = []
         self._truth: Arrays | None = None  # the last rows of it, to compare estimates with
@@ -240,7 +250,7 @@ class Builder:
 
     def send(self, tables: Iterable[Table]) -> bool:
         """Send rows. True when something came that the blueprint does not show yet."""
-        before = len(self.shown.plots) + len(self.shown.lanes) + len(self.shown.trails)
+        before = self.shown.size
         order = list(self._draw)
         for table in sorted(tables, key=lambda t: order.index(t.schema.name) if t.schema.name in order else len(order)):
             if not len(table.cycle):
@@ -248,9 +258,11 @@ class Builder:
             draw, needs = self._draw.get(table.schema.name, (None, ()))
             if draw is not None and all(name in table.columns for name in needs):
                 draw(table)
-            if table.schema.name not in ("Site", "Course", "Scene"):  # written once: nothing to plot
+            if is_json(table.schema.fields):
+                self._modules.send(table)
+            elif table.schema.name not in ("Site", "Course", "Scene"):  # written once: nothing to plot
                 self._signals(table)
-        return before != len(self.shown.plots) + len(self.shown.lanes) + len(self.shown.trails)
+        return before != self.shown.size
 
     def _index(self, cycle: Any) -> list[rr.TimeColumn]:
         return [
@@ -557,7 +569,7 @@ def _circle(x_m: float, y_m: float, radius_m: float, z_m: float) -> Any:
 
 def blueprint(shown: _Shown, *, live: bool = False) -> rrb.Blueprint:
     """Lay out the views: one tab of the drive, one tab for each component."""
-    components = sorted({topic.partition("/")[0] for topic, _ in [*shown.plots, *shown.lanes]})
+    components = sorted({topic.partition("/")[0] for topic, _ in [*shown.plots, *shown.lanes]} | shown.texts.keys())
     return rrb.Blueprint(
         rrb.Tabs(_drive_tab(shown), *(_component_tab(shown, name) for name in components), active_tab=0),
         rrb.BlueprintPanel(state="collapsed"),
@@ -681,6 +693,8 @@ def _component_tab(shown: _Shown, component: str) -> rrb.Container:
     ]
     if any(topic.partition("/")[0] == component for topic, _ in shown.lanes):
         views.append(rrb.StateTimelineView(origin=_path("states", component), name="states", time_view=ALL_TIME))
+    if component in shown.texts:
+        views.append(rrb.TextLogView(origin="texts", contents=_these(shown.texts[component]), name="what it says"))
     return rrb.Grid(*views, name=component)
 
 

@@ -226,7 +226,8 @@ class Drive:
         """Say whether nobody will move the cart again: it has arrived, is far astray, or something failed for good."""
         if self.hal.driver.state is SystemState.FAULT:
             return True
-        return bool(self.lost) or any(is_end(self._value(obj, cycle)) for obj in (*self._ends, *self._statuses))
+        shown: list[Object[Any]] = [*self._ends, *self._statuses]
+        return bool(self.lost) or any(is_end(self._value(obj, cycle)) for obj in shown)
 
     @staticmethod
     def _value(obj: Object[Any], cycle: int) -> Any:

@@ -79,7 +79,7 @@ class Session:
 
     def command(self, line: str, number: int) -> None:
         text, _, comment = line.partition(" #")
-        words = re.sub(r"(--db[ =]\S+)", rf"\1-{os.getpid()}", text).split()
+        words = re.sub(r"(--db[ =]\S+|^fairway wire \S+)", rf"\1-{os.getpid()}", text).split()
         stated = re.search(r"exit (\d+)", comment)
         expected = int(stated[1]) if stated else 0
         argv = [sys.executable, "-m", "scenarios.cli", *words[1:]]
@@ -465,18 +465,86 @@ def objects(old: str) -> str:
 
     del old
     with Drive(Setup(scenario=load_scenario("parking-lot/square"))) as run:
+        of_json = {"config": "How the module is wired.", "show": "What the module shows."}
         rows = [
-            (code(o.name), code(o.schema.name), f"{o.every * 10} ms", o.schema.doc.partition("\n")[0])
+            (
+                code(o.name),
+                code(o.schema.name),
+                f"{o.every * 10} ms",
+                of_json.get(o.name.partition("/")[2], o.schema.doc.partition("\n")[0]),
+            )
             for o in sorted(run.cart.objects(), key=lambda o: o.name)
         ]
     return table("object | record | visible every | what it holds", rows)
 
 
+def environments(old: str) -> str:
+    from scenarios.gym import IDS, CartEnv
+    from scenarios.scenario import load_scenario
+
+    del old
+    rows = []
+    for name, kwargs in IDS.items():
+        if not kwargs:
+            rows.append((code(name), "any", "any", "", "a scenario of your own"))
+            continue
+        env = CartEnv(**kwargs)
+        about = load_scenario(kwargs["scenario"]).about.partition(". ")[0].removesuffix(".")
+        rows.append((code(name), code(kwargs["scenario"]), code(env.agent), f"{env.dt_s * 1e3:g} ms", about))
+    return table("environment | scenario | agent | step | what it is", rows)
+
+
+def seats(old: str) -> str:
+    from autonomy.seats import SEATS
+
+    del old
+
+    def said(doc: str | None) -> str:
+        return " ".join((doc or "").split())
+
+    rows = [
+        (code(name), ", ".join(f.name for f in seat.sees), str(seat.n_actions), f"{said(seat.__doc__)} {said(seat.act.__doc__)}")
+        for name, seat in SEATS.items()
+    ]
+    return table("agent | sees | numbers of an action | what it does", rows)
+
+
+def features(old: str) -> str:
+    from autonomy.features import TRUTH
+    from autonomy.seats import SEATS
+
+    del old
+    known = {f.name: f for seat in SEATS.values() for f in reversed(seat.sees)} | {TRUTH.name: TRUTH}
+    rows = [(code(f.name), str(f.size), f"{f.low:.4g}", f"{f.high:.4g}", f.doc) for f in known.values()]
+    return table("feature | numbers | low | high | what they are", rows)
+
+
+def rewards(old: str) -> str:
+    from scenarios import referee
+
+    del old
+    said = dict(re.findall(r"^    (\w+) {2,}(.*)$", referee.__doc__ or "", re.MULTILINE))
+    assert tuple(said) == referee.TERMS
+    return table("term | in a step of dt seconds", [(code(name), text) for name, text in said.items()])
+
+
+def randomisation(old: str) -> str:
+    from rtdb.records import schema_of
+    from scenarios.randomise import RANGES, Randomised
+
+    del old
+    rows = [
+        (code(f.name), *(f"{low:g} to {high:g}" for low, high in (getattr(r, f.name) for r in RANGES.values())), f.spec.doc)
+        for f in schema_of(Randomised).fields
+    ]
+    return table(f"what | {' | '.join(RANGES)} | meaning", rows)
+
+
 TABLES: dict[str, Callable[[str], str]] = {
     function.__name__.replace("_", "-"): function
     for function in (
-        can_layout, cart_parameters, command_list, fault_codes, gps_grades, library, limit_reasons, metrics, numbers,
-        objects, scenario_keys,
+        can_layout, cart_parameters, command_list, environments, fault_codes, features, gps_grades, library,
+        limit_reasons, metrics, numbers, objects, randomisation, rewards, scenario_keys, seats,
     )
 }  # fmt: skip
 

@@ -104,6 +104,65 @@ def test_causes_are_read_back_by_topic(path):
     assert causes == [(3, (("a/in", 2),)), (5, (("a/in", 4),)), (7, (("a/in", 6),)), (9, (("a/in", 8),))]
 
 
+def test_who_catches_up_now_and_then_records_what_one_does_who_comes_after_each_tick(tmp_path):
+    with Store.create(t0_ns=T0_NS) as cart, Store.create(t0_ns=T0_NS) as world:
+        a = cart.join("a").insert("in", Mixed)
+        b = cart.join("b").insert("out", Count, every=2, n_causes=1)
+        c = world.join("c").insert("slow", Count, every=5, phase=3)
+        with (
+            Recorder(tmp_path / "each.mcap", [cart, world], {}) as each,
+            Recorder(tmp_path / "now-and-then.mcap", [cart, world], {}) as looking_on,
+        ):
+            for k in range(1, 120):
+                b.write(Count(k), inputs=[cart.at_cycle(k - 1).get(a)] if k > 2 else ())
+                a.write(mixed(k))
+                c.write(Count(k))
+                if k == 60:
+                    cart.join("late").insert("comer", Count).write(Count(1))
+                cart.tick()
+                world.tick()
+                each.record()
+                if k % 17 == 0:
+                    looking_on.catch_up(k)
+            looking_on.catch_up(k)
+    one, other = Recording(tmp_path / "each.mcap"), Recording(tmp_path / "now-and-then.mcap")
+    assert other.trace_hash() == one.trace_hash()
+    assert other.last_cycle == one.last_cycle
+    assert looking_on.lost == 0
+
+
+def test_who_catches_up_too_late_counts_what_aged_out(path):
+    with Store.create() as store:
+        n = store.join("a").insert("n", Count, history_s=0.05)
+        with Recorder(path, [store], {}) as recorder:
+            for k in range(100):
+                n.write(Count(k))
+                store.tick()
+            recorder.catch_up(store.cycle)
+        rows = Recording(path).read("a/n", Count)
+        assert 0 < len(rows) < 100
+        assert recorder.lost == 100 - len(rows)
+        assert all(row.value.n == row.cycle - 1 for row in rows)
+
+
+def test_stores_of_different_times_are_recorded_in_that_of_the_first_and_one_that_stands_is_not_waited_for(path):
+    with Store.create(t0_ns=T0_NS) as cart, Store.create(t0_ns=5_000) as world:
+        n, m = cart.join("a").insert("n", Count), world.join("b").insert("m", Count)
+        n.write(Count(1), t_data_ns=T0_NS + 7)
+        m.write(Count(2), t_data_ns=5_007)
+        cart.tick()
+        for _ in range(3):
+            world.tick()
+        m.write(Count(3))
+        world.tick()
+        with Recorder(path, [cart, world], {}) as recorder:
+            recorder.catch_up(4)
+    recording = Recording(path)
+    assert [(row.cycle, row.t_data_ns) for row in recording.read("a/n", Count)] == [(1, T0_NS + 7)]
+    assert [(row.cycle, row.value.n) for row in recording.read("b/m", Count)] == [(1, 2), (4, 3)]
+    assert recording.read("b/m", Count)[0].t_data_ns == T0_NS + 7
+
+
 def test_objects_that_come_during_the_recording_are_in_it(path):
     with Store.create() as store, Recorder(path, [store], {}) as recorder:
         a = store.join("a")

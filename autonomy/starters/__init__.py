@@ -1,0 +1,1 @@
+"""What `fairway new` writes: a module of each kind, and its test."""
