@@ -124,9 +124,11 @@ class Drive:
         site = scenario.load_site()
         try:
             course = plan.course_record(scenario, site, rng)
+            boxes = plan.obstacles(scenario, site, course, rng)
         except CourseImpossible as error:
             raise DriveError(str(error), invalid=True) from error
-        self._write_mission(plan.site_record(site), course)
+        self._write_mission(plan.site_record(site), course, plan.map_record(site, boxes) if boxes else None)
+        site = plan.furnished(site, boxes)
         self.sim = SimCart(plan.sim_setup(scenario, site, self.setup.level, self.setup.plant, rng), rng)
         self.sim.bus.faults += plan.bus_faults(scenario, rng)
         self._events = plan.fault_events(scenario)
@@ -134,7 +136,7 @@ class Drive:
         self._drivers: list[GpsHost | CompassHost] = [GpsHost(self.cart, GpsDriver(GPS_LATENCY_NS), self.sim.gps)]
         if self.sim.compass is not None:
             self._drivers.append(CompassHost(self.cart, CompassDriver(self.sim.declination_rad), self.sim.compass))
-        self._scan = self.cart.join("laser").insert("scan", Scan, history_s=0.5) if scenario.laser else None
+        self._scan = self.cart.join("synlaser").insert("scan", Scan, history_s=0.5) if scenario.laser else None
         self.hal = CartHost(self.cart, self.sim.bus)
         if self.setup.by_hand:
             self._hand = HandHost(self.cart).__enter__()
@@ -184,10 +186,12 @@ class Drive:
                 raise DriveError(f"{names} did not come within {PARTICIPANT_S:.0f} s", invalid=False)
             self.cart.core.wait_directory(version, 100_000_000)
 
-    def _write_mission(self, site: SiteRecord, course: Course) -> None:
+    def _write_mission(self, site: SiteRecord, course: Course, surveyed: Scene | None) -> None:
         mission, t0_ns = self.cart.join("mission"), self.cart.t0_ns
         mission.insert("site", SiteRecord, history_s=0.05, flags=STATIC).write(site, t0_ns)
         mission.insert("course", Course, history_s=0.05, flags=STATIC).write(course, t0_ns)
+        if surveyed is not None:
+            mission.insert("map", Scene, history_s=0.05, flags=STATIC).write(surveyed, t0_ns)
 
     def _write_world(self) -> None:
         world = self.world.join("world")
