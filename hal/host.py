@@ -4,10 +4,10 @@ Objects: gps/fix, compass/heading, odometry/travel, safety/state, actuators/stat
 each transport. All are visible at the tick after the one at which they were heard.
 """
 
-from rtdb import HOST_DEPENDENT, Object, Store
+from rtdb import HOST_DEPENDENT, Object, Sample, Store
 
 from .bus import CanBus
-from .drivers.cart import CartDriver
+from .drivers.cart import BURST_NS, SYSTEM_NS, CartDriver
 from .drivers.compass import CompassDriver
 from .drivers.gps import GpsDriver
 from .limits import Envelope
@@ -69,7 +69,7 @@ class CartHost:
     """The cart's drivers on a store."""
 
     def __init__(self, store: Store, bus: CanBus, envelope: Envelope | None = None) -> None:
-        self._store = store
+        self._t0_ns, self._tick_ns = store.t0_ns, store.tick_ns
         self.driver = CartDriver(bus, METRES_PER_TICK, envelope)
         self._travel = store.join("odometry").insert("travel", Odometry)
         self._safety = store.join("safety").insert("state", SafetyState)
@@ -78,10 +78,11 @@ class CartHost:
         self._command = actuators.insert("command", ActuatorCommand, n_causes=1)
         self._counters = actuators.insert("counters", LinkCounters, every=10, flags=HOST_DEPENDENT)
         self._drive: Object[DriveCommand] | None = None
+        self._obeyed: Sample[DriveCommand] | None = None
 
     def obey(self, drive: Object[DriveCommand]) -> None:
         """Take commands from an object. Call it while disabled only."""
-        self._drive = drive
+        self._drive, self._obeyed = drive, None
 
     def step(self, cycle: int, t_ns: int) -> None:
         """Read the bus, commit what was heard, send what is due."""
@@ -92,11 +93,16 @@ class CartHost:
             self._safety.write(safety, t_data_ns)
         for actuators, t_data_ns in heard.actuators:
             self._state.write(actuators, t_data_ns)
-        sample = self._drive.visible(cycle) if self._drive is not None else None
-        origin_ns = sample.t_data_ns if sample is not None else t_ns
-        origin_cycle = (origin_ns - self._store.t0_ns) // self._store.tick_ns
-        sent = self.driver.command(t_ns, sample.value if sample is not None else None, origin_ns, origin_cycle)
-        if sent is not None:
-            self._command.write(sent, inputs=(sample,) if sample is not None else ())
+        if t_ns % BURST_NS == 0 or t_ns % SYSTEM_NS == 0:
+            self._send(cycle, t_ns)
         if t_ns % COUNTERS_NS == 0:
             self._counters.write(self.driver.counters, t_ns)
+
+    def _send(self, cycle: int, t_ns: int) -> None:
+        """Send the command that this cut shows."""
+        sample = self._obeyed = self._drive.visible_since(cycle, self._obeyed) if self._drive is not None else None
+        command, origin_ns = (sample.value, sample.t_data_ns) if sample is not None else (None, t_ns)
+        origin_cycle = (origin_ns - self._t0_ns) // self._tick_ns
+        sent = self.driver.command(t_ns, command, origin_ns, origin_cycle)
+        if sent is not None:
+            self._command.write(sent, inputs=(sample,) if sample is not None else ())
