@@ -1,4 +1,4 @@
-"""Follow: plan a line through the way-points once, then track it by pure pursuit.
+"""Follow: plan a line through the way-points, once per course, then track it by pure pursuit.
 
 The line: straight legs whose corners are rounded as far as the target radius of the way-point allows, so that turns are
 taken economically; a corner too sharp for that is driven up to and turned at full lock. Along the line stands a speed
@@ -50,11 +50,17 @@ class Follow(Module):
         """Forget the line."""
         self._line: list[Station] = []
         self._at = 0
+        self._course: Course | None = None
 
     def step(self) -> None:
         """Aim at the goal point; choose the speed."""
-        if not self._line:
-            self._line = self._plan()
+        if self.course is not self._course:
+            if self.course != self._course:  # the first one, or a new one
+                self._line, self._at = self._plan() if self.course.lat_rad else [], 0
+            self._course = self.course
+        if not self._line:  # a course without way-points: it knows no way
+            self.drive, self.state = DriveCommand(0.0, 0.0, 1.0), FollowState()
+            return
         here = (self.pose.x_m, self.pose.y_m)
         self._at = nearest(self._line, self._at, here)
         end = self._line[-1]

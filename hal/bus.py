@@ -38,34 +38,56 @@ Fault = Callable[[Frame], Frame | None]
 """Stands on the wire: passes a frame on, changes it, or swallows it (None)."""
 
 
+class Sent:
+    """What a port knows of one id that it sends: the next counter, and the ports that hear it."""
+
+    __slots__ = ("counter", "heard_by")
+
+    def __init__(self) -> None:
+        self.counter = 0
+        self.heard_by: tuple[CanPort, ...] | None = None  # None: to be looked up
+
+
 class CanPort:
     """One node's connection: sends, and queues what passes its acceptance filter."""
 
+    __slots__ = ("_bus", "_queue", "accept", "damaged", "hear", "name", "sent")
+
     def __init__(self, bus: "CanBus", name: str, accept: frozenset[int]) -> None:
         self._bus, self.name, self.accept = bus, name, accept
-        self._counters: dict[int, int] = {}
+        self.sent: dict[int, Sent] = {}
         self._queue: list[Received] = []
+        self.hear = self._queue.append
         self.damaged = 0
 
     def send(self, message: Message, t_ns: int) -> None:
         """Put a message on the bus, with the next counter of its id."""
-        counter = self._counters.get(message.ID, 0)
-        self._counters[message.ID] = (counter + 1) & 15
-        data = encode(message, counter) if self._bus.level == "wire" else message
-        self._bus.carry(Frame(t_ns, self.name, message.ID, data, counter))
-
-    def hear(self, received: Received) -> None:
-        """Queue what came from the bus."""
-        self._queue.append(received)
+        bus, frame_id = self._bus, message.ID
+        sent = self.sent.get(frame_id)
+        if sent is None:
+            sent = self.sent[frame_id] = Sent()
+        counter = sent.counter
+        sent.counter = (counter + 1) & 15
+        data = encode(message, counter) if bus.level == "wire" else None
+        if bus.faults:
+            bus.carry(Frame(t_ns, self.name, frame_id, message if data is None else data, counter))
+            return
+        if data is not None:
+            message, counter = decode(frame_id, data)
+        bus.frames += 1
+        if sent.heard_by is None:
+            sent.heard_by = bus.listeners(self.name, frame_id)
+        received = Received(t_ns, frame_id, message, counter)
+        for port in sent.heard_by:
+            port.hear(received)
 
     def receive(self) -> list[Received]:
         """Take everything that has come since the last call, in order."""
-        if not self._queue:
+        queue = self._queue
+        if not queue:
             return []
-        heard, self._queue = self._queue, []
-        for received in heard:
-            if received.message is None:
-                self.damaged += 1
+        heard = queue.copy()
+        queue.clear()
         return heard
 
 
@@ -90,14 +112,19 @@ class CanBus:
         self.faults: list[Fault] = []
         self.frames = 0
         self._ports: list[CanPort] = []
-        self._routes: dict[tuple[str, int], tuple[CanPort, ...]] = {}
 
     def port(self, name: str, accept: Iterable[type[Message]]) -> CanPort:
         """Connect a node that hears the given messages."""
         port = CanPort(self, name, frozenset(message.ID for message in accept))
         self._ports.append(port)
-        self._routes.clear()
+        for sender in self._ports:
+            for sent in sender.sent.values():
+                sent.heard_by = None
         return port
+
+    def listeners(self, sender: str, frame_id: int) -> tuple[CanPort, ...]:
+        """List the ports that hear a frame."""
+        return tuple(p for p in self._ports if frame_id in p.accept and p.name != sender)
 
     def carry(self, frame: Frame) -> None:
         """Deliver one frame through the faults."""
@@ -107,12 +134,7 @@ class CanBus:
             if passed is None:
                 return
             frame = passed
-        key = (frame.sender, frame.frame_id)
-        route = self._routes.get(key)
-        if route is None:
-            route = self._routes[key] = tuple(
-                p for p in self._ports if frame.frame_id in p.accept and p.name != frame.sender
-            )
         received = read(frame)
-        for port in route:
+        for port in self.listeners(frame.sender, frame.frame_id):
             port.hear(received)
+            port.damaged += received.message is None

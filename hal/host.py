@@ -10,11 +10,11 @@ the store are the store's.
 
 from typing import Any
 
-from rtdb import HOST_DEPENDENT, Flag, Object, RtdbError, State, Store, Writer
+from rtdb import HOST_DEPENDENT, Flag, Object, RtdbError, Sample, State, Store, Writer
 from rtdb.json_object import json_schema
 
 from .bus import CanBus
-from .drivers.cart import CartDriver
+from .drivers.cart import BURST_NS, SYSTEM_NS, CartDriver
 from .drivers.compass import CompassDriver
 from .drivers.gps import GpsDriver
 from .errors import WiringError
@@ -84,7 +84,7 @@ class CartHost:
     """The cart's drivers on a store."""
 
     def __init__(self, store: Store, bus: CanBus, envelope: Envelope | None = None) -> None:
-        self._store = store
+        self._store, self._t0_ns, self._tick_ns = store, store.t0_ns, store.tick_ns
         self.driver = CartDriver(bus, METRES_PER_TICK, envelope)
         self._travel = store.join("odometry").insert("travel", Odometry)
         self._safety = store.join("safety").insert("state", SafetyState)
@@ -97,12 +97,13 @@ class CartHost:
         )
         self._configured = 0
         self._drive: Object[DriveCommand] | None = None
+        self._obeyed: Sample[DriveCommand] | None = None
         self._pointer, self._stopped = "", False
 
     def obey(self, pointer: str, timeout_s: float = 0.0) -> None:
         """Take commands from an object in the store. While disabled only."""
         self._drive = self._store.find(pointer, DriveCommand, timeout_s=timeout_s)
-        self._pointer = pointer
+        self._pointer, self._obeyed = pointer, None
         self._configured = self._config.write({"inputs": {"drive": pointer}})
 
     def stop(self) -> None:
@@ -111,7 +112,7 @@ class CartHost:
 
     def step(self, cycle: int, t_ns: int) -> None:
         """Read the bus, commit what was heard, send what is due."""
-        ahead = ahead_ns(self._store, cycle, t_ns)
+        ahead = self._t0_ns + cycle * self._tick_ns - t_ns
         heard = self.driver.poll()
         for odometry, t_data_ns in heard.odometry:
             self._travel.write(odometry, t_data_ns + ahead)
@@ -121,14 +122,19 @@ class CartHost:
             self._state.write(actuators, t_data_ns + ahead)
         if not self._stopped and self._store.core.visible_write(self._config.handle, cycle) > self._configured:
             self._rewire(cycle)
-        sample = self._drive.visible(cycle) if self._drive is not None else None
-        origin_ns = sample.t_data_ns if sample is not None else t_ns + ahead
-        origin_cycle = (origin_ns - self._store.t0_ns) // self._store.tick_ns
-        sent = self.driver.command(t_ns, sample.value if sample is not None else None, origin_ns - ahead, origin_cycle)
-        if sent is not None:
-            self._command.write(sent, t_ns + ahead if sample is None else None, inputs=(sample,) if sample else ())
+        if t_ns % BURST_NS == 0 or t_ns % SYSTEM_NS == 0:
+            self._send(cycle, t_ns, ahead)
         if t_ns % COUNTERS_NS == 0:
             self._counters.write(self.driver.counters, t_ns + ahead)
+
+    def _send(self, cycle: int, t_ns: int, ahead: int) -> None:
+        """Send the command that this cut shows."""
+        sample = self._obeyed = self._drive.visible_since(cycle, self._obeyed) if self._drive is not None else None
+        command, origin_ns = (sample.value, sample.t_data_ns) if sample is not None else (None, t_ns + ahead)
+        origin_cycle = (origin_ns - self._t0_ns) // self._tick_ns
+        sent = self.driver.command(t_ns, command, origin_ns - ahead, origin_cycle)
+        if sent is not None:
+            self._command.write(sent, t_ns + ahead if sample is None else None, inputs=(sample,) if sample else ())
 
     def _rewire(self, cycle: int) -> None:
         """Obey the command that somebody names from now on, or stay with the present one; `health` says which."""

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 from .signals import DriveCommand, Limit
 
+WITHIN = Limit.NONE  # looked up once, being what most commands are
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Envelope:
@@ -28,23 +30,25 @@ def limit(command: DriveCommand | None, origin_age_ns: int, envelope: Envelope) 
 
     origin_age_ns: time since the oldest sensor data behind the command was true.
     """
-    stop = DriveCommand(speed_mps=0.0, steer_rad=0.0, decel_mps2=envelope.max_decel_mps2)
     if command is None:
-        return stop, Limit.NO_COMMAND
-    if not math.isfinite(command.speed_mps + command.steer_rad + command.decel_mps2):
-        return stop, Limit.NOT_FINITE
-    if abs(command.steer_rad) > envelope.max_steer_rad:
-        return stop, Limit.STEER
-    steer_rad = command.steer_rad
-    stop = DriveCommand(speed_mps=0.0, steer_rad=steer_rad, decel_mps2=envelope.max_decel_mps2)
+        return _stop(0.0, envelope), Limit.NO_COMMAND
+    speed_mps, steer_rad = command.speed_mps, command.steer_rad
+    if not math.isfinite(speed_mps + steer_rad + command.decel_mps2):
+        return _stop(0.0, envelope), Limit.NOT_FINITE
+    if abs(steer_rad) > envelope.max_steer_rad:
+        return _stop(0.0, envelope), Limit.STEER
     if origin_age_ns > envelope.max_origin_age_ns:
-        return stop, Limit.STALE
-    if not -envelope.max_reverse_mps <= command.speed_mps <= envelope.max_speed_mps:
-        return stop, Limit.SPEED
+        return _stop(steer_rad, envelope), Limit.STALE
+    if not -envelope.max_reverse_mps <= speed_mps <= envelope.max_speed_mps:
+        return _stop(steer_rad, envelope), Limit.SPEED
     curvature = abs(math.tan(steer_rad)) / envelope.wheelbase_m
     cornering_mps = math.sqrt(envelope.max_lateral_mps2 / curvature) if curvature > 1e-9 else math.inf
     decel_mps2 = min(max(command.decel_mps2, 0.1), envelope.max_decel_mps2)
-    if abs(command.speed_mps) > cornering_mps:
-        slower = math.copysign(cornering_mps, command.speed_mps)
+    if abs(speed_mps) > cornering_mps:
+        slower = math.copysign(cornering_mps, speed_mps)
         return DriveCommand(speed_mps=slower, steer_rad=steer_rad, decel_mps2=decel_mps2), Limit.LATERAL
-    return DriveCommand(speed_mps=command.speed_mps, steer_rad=steer_rad, decel_mps2=decel_mps2), Limit.NONE
+    return DriveCommand(speed_mps, steer_rad, decel_mps2), WITHIN
+
+
+def _stop(steer_rad: float, envelope: Envelope) -> DriveCommand:
+    return DriveCommand(speed_mps=0.0, steer_rad=steer_rad, decel_mps2=envelope.max_decel_mps2)

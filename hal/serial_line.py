@@ -25,9 +25,10 @@ class SerialDriver(Protocol):
 def carry(device: SerialDevice, driver: SerialDriver, t_ns: int) -> None:
     """Move what has arrived by t_ns."""
     sent = device.poll(t_ns)
+    if not sent:
+        return  # as at most ticks
     if isinstance(sent, bytes):
-        if sent:
-            driver.feed(sent, t_ns)
+        driver.feed(sent, t_ns)
     else:
         for message in sent:
             driver.hear(message, t_ns)

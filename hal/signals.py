@@ -271,6 +271,24 @@ class FollowState(Record, frozen=True):
     lateral_error_m: Annotated[float, f8("m", "signed distance of C from the course line, left positive")] = 0.0
 
 
+class PlanState(Record, frozen=True):
+    """What the route planner found."""
+
+    found: Annotated[bool, flag("there is a way to all way-points that are left")] = False
+    length_m: Annotated[float, f8("m", "length of the route, from where the cart was when it was planned")] = 0.0
+    reason: Annotated[str, text(160, "why there is none")] = ""
+
+
+class AvoidState(Record, frozen=True):
+    """What the avoider sees. Its sectors are road-wheel angles, from right to left."""
+
+    turned: Annotated[bool, flag("it steers elsewhere than it is told to")] = False
+    stuck: Annotated[bool, flag("no sector is free: it stands")] = False
+    first_rad: Annotated[float, f8("rad", "road-wheel angle of the first sector")] = 0.0
+    step_rad: Annotated[float, f8("rad", "angle between sectors")] = 0.0
+    free_m: Annotated[tuple[float, ...], seq("f4", 64, "m", "free way of the body in each sector; none: no scan")] = ()
+
+
 class Hold(IntEnum):
     """Why the guard holds the cart back."""
 

@@ -68,6 +68,7 @@ class Object(Generic[R]):
         raw = store.core.object(handle)
         self.name, self.oid, self._component, schema, self.size, self.n_slots, self.every, self.phase = raw[:8]
         self.flags, self.n_causes, self.parent = Flag(raw[8]), raw[9], raw[10]
+        self.static = bool(raw[8] & STATIC)  # asked of every input of every write
         self.t_insert_ns, self.t_history_ns, self.min_cycle_ns, self.max_age_ns = raw[13], raw[15], raw[16], raw[17]
         stored = store.schema(schema)
         if stored.size != self.size:
@@ -353,6 +354,6 @@ def inherited(inputs: Iterable[Sample[Any]]) -> tuple[int | None, Causes]:
         if sample.source is None:
             raise RecordError(f"a sample made by hand is no input: {sample.value!r:.80}; read it from the store")
         causes.append((sample.source.oid, sample.write))
-        if not sample.source.flags & STATIC and (t_ns is None or sample.t_data_ns < t_ns):
+        if not sample.source.static and (t_ns is None or sample.t_data_ns < t_ns):
             t_ns = sample.t_data_ns
     return t_ns, tuple(causes)

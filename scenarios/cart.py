@@ -65,10 +65,12 @@ class SimulatedCart:
         site = scenario.load_site()
         try:
             course = plan.course_record(scenario, site, rng)
+            boxes = plan.obstacles(scenario, site, course, rng)
         except CourseImpossible as error:
             raise DriveError(str(error), invalid=True) from error
         self.course = course
-        self._write_mission(plan.site_record(site), course)
+        self._write_mission(plan.site_record(site), course, plan.map_record(site, boxes) if boxes else None)
+        site = plan.furnished(site, boxes)
         drawn = draw(setup.randomise, rng("randomise"))
         sim_setup = plan.sim_setup(scenario, site, setup.level, setup.plant, rng, drawn)
         self.sim = SimCart(sim_setup, rng, setup.make_world)
@@ -78,7 +80,7 @@ class SimulatedCart:
         drivers: list[GpsHost | CompassHost] = [GpsHost(cart, GpsDriver(GPS_LATENCY_NS), self.sim.gps)]
         if self.sim.compass is not None:
             drivers.append(CompassHost(cart, CompassDriver(self.sim.declination_rad), self.sim.compass))
-        self._scan = cart.join("laser").insert("scan", Scan, history_s=0.5) if scenario.laser else None
+        self._scan = cart.join("synlaser").insert("scan", Scan, history_s=0.5) if scenario.laser else None
         self.hal = CartHost(cart, self.sim.bus)
         self.work: list[Callable[[int, int], None]] = [
             *(driver.step for driver in drivers),
@@ -86,10 +88,12 @@ class SimulatedCart:
             *([self._write_scan] if self._scan else []),
         ]
 
-    def _write_mission(self, site: SiteRecord, course: Course) -> None:
+    def _write_mission(self, site: SiteRecord, course: Course, surveyed: Scene | None) -> None:
         mission, now_ns = self.cart.join("mission"), self.cart.now_ns
         mission.insert("site", SiteRecord, history_s=0.05, flags=STATIC).write(site, now_ns)
         mission.insert("course", Course, history_s=0.05, flags=STATIC).write(course, now_ns)
+        if surveyed is not None:
+            mission.insert("map", Scene, history_s=0.05, flags=STATIC).write(surveyed, now_ns)
 
     def _write_world(self, drawn: Randomised) -> None:
         world = self.world.join("world")

@@ -6,20 +6,24 @@ from collections.abc import Callable
 
 import numpy as np
 
+from autonomy.plan import Target
 from hal.bus import Fault, Level
 from hal.faults import Corruption, HostSilence
-from hal.signals import Course, FaultEvent, ObstacleKind
+from hal.signals import Course, FaultEvent, ObstacleKind, Scene
 from hal.signals import Site as SiteRecord
 from sim.actors import Actor
 from sim.cart import Outage, PlantKind, SimSetup, Start
-from sim.laser import LaserParams
 from sim.plant import CartParams
-from sim.site import Site
+from sim.site import Site, scene_of
+from sim.synlaser import SynLaserParams
+from sim.terrain import Terrain
 
-from .course import hidden_course
+from .course import CourseImpossible, hidden_course
+from .field import draw_field
 from .randomise import Randomised
-from .scenario import CanCorruptionFault, GpsOutageFault, HostSilenceFault, Scenario
+from .scenario import CanCorruptionFault, GpsOutageFault, HostSilenceFault, ObstacleSetup, Scenario
 
+MOST_BOXES = 192  # as many as a Scene holds
 Rng = Callable[[str], np.random.Generator]
 
 
@@ -63,6 +67,31 @@ def course_record(scenario: Scenario, site: Site, rng: Rng) -> Course:
     )
 
 
+def obstacles(scenario: Scenario, site: Site, course: Course, rng: Rng) -> tuple[ObstacleSetup, ...]:
+    """Give what stands there besides the site's own: what the scenario lists, then the field of this seed."""
+    boxes, mark = scenario.obstacles, scenario.start
+    if scenario.field is not None:
+        geo = zip(course.lat_rad, course.lon_rad, course.radius_m, strict=True)
+        waypoints = [Target(*site.plane.to_map(lat, lon), radius_m) for lat, lon, radius_m in geo]
+        start = (mark.east_m, mark.north_m)
+        boxes += draw_field(scenario.field, furnished(site, boxes), start, waypoints, rng("field"))
+    if len(furnished(site, boxes).all_obstacles()) > MOST_BOXES:
+        raise CourseImpossible(f"more than {MOST_BOXES} obstacles, those of site {site.name} included")
+    return boxes
+
+
+def furnished(site: Site, boxes: tuple[ObstacleSetup, ...]) -> Site:
+    """Give the site with more obstacles on it."""
+    return site.model_copy(update={"obstacles": (*site.obstacles, *boxes)})
+
+
+def map_record(site: Site, boxes: tuple[ObstacleSetup, ...]) -> Scene:
+    """Give the cart's map: what was surveyed of all that stands there."""
+    seen = furnished(site, tuple(box for box in boxes if box.surveyed))
+    terrain = Terrain(site.hills, 1.0)
+    return scene_of(seen, {k: terrain.height_m(b.east_m, b.north_m) for k, b in enumerate(seen.all_obstacles())})
+
+
 def sim_setup(
     scenario: Scenario, site: Site, level: Level, plant: PlantKind, rng: Rng, drawn: Randomised
 ) -> SimSetup:
@@ -92,7 +121,7 @@ def sim_setup(
         compass=scenario.compass.personality,
         laser=None
         if laser is None
-        else LaserParams(reach_m=laser.reach_m, fov_rad=math.radians(laser.fov_deg), rays=laser.rays),
+        else SynLaserParams(reach_m=laser.reach_m, fov_rad=math.radians(laser.fov_deg), rays=laser.rays),
         actors=tuple(
             Actor(ObstacleKind[a.kind.upper()], a.path_m, a.speed_mps, at(scenario, a.at_s), a.pauses_s)
             for a in scenario.actors

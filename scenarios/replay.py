@@ -342,6 +342,12 @@ class Builder:
             return
         columns = {name: column[-1] for name, column in table.columns.items()}
         geo = zip(columns["lat_rad"], columns["lon_rad"], columns["radius_m"], strict=True)
+        if table.component != "mission":  # a route that somebody planned
+            line = [(*self._plane.to_map(lat, lon), 0.04) for lat, lon, _ in geo]
+            self._stream.log(
+                _path("scene", table.topic), rr.LineStrips3D([line], colors=WANTED, radii=0.03), static=True
+            )
+            return
         self._waypoints = [(*self._plane.to_map(lat, lon), float(radius)) for lat, lon, radius in geo]
         line = [(x, y, 0.03) for x, y, _ in self._waypoints]
         if columns.get("start_sigma_m", 0.0) > 0:
@@ -385,7 +391,7 @@ class Builder:
         c = {name: column[-1] for name, column in table.columns.items()}
         if len(c["kind"]):
             self._stream.log(
-                "scene/obstacles",
+                "scene/obstacles" if table.component == "world" else "scene/map",
                 rr.Boxes3D(
                     centers=np.column_stack([c["x_m"], c["y_m"], c["z_m"]]),
                     sizes=np.column_stack([c["length_m"], c["width_m"], c["height_m"]]),

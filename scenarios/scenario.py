@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from sim.site import SITES, Site, site_names
+from sim.site import SITES, Obstacle, Site, site_names
 
 from .judge import Criterion
 
@@ -90,6 +90,42 @@ class ActorSetup(_Strict):
     pauses_s: tuple[float, ...] = Field(default=(), description="how long to stand at each inner point of the path")
 
 
+class ObstacleSetup(Obstacle):
+    """Something that stands about in this drive."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    surveyed: bool = Field(default=True, description="it stands on the cart's map; else only a sensor can find it")
+
+
+Range = tuple[float, float]
+
+
+class FieldSetup(_Strict):
+    """Boxes drawn from the seed; there is always a way from the start to the finish."""
+
+    count: int = Field(ge=1, le=48, description="how many boxes")
+    unsurveyed: int = Field(default=0, ge=0, description="how many of them are not on the cart's map")
+    east_m: Range = Field(description="from, to: where their centres are")
+    north_m: Range = Field(description="from, to")
+    size_m: Range = Field(default=(0.8, 2.0), description="from, to: length and width; all are 1 m high")
+    min_gap_m: float = Field(
+        default=3.5, ge=0.0, le=20.0, description="between any two of them, and to what stands there"
+    )
+
+    @model_validator(mode="after")
+    def _ranges(self) -> "FieldSetup":
+        for name in ("east_m", "north_m", "size_m"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name} is [from, to], got {low:g} before {high:g}")
+        if self.size_m[0] <= 0:
+            raise ValueError("size_m is larger than 0")
+        if self.unsurveyed > self.count:
+            raise ValueError(f"unsurveyed is at most count, {self.count}")
+        return self
+
+
 class HostSilenceFault(_Strict):
     """The host's CAN frames stop."""
 
@@ -130,6 +166,10 @@ class Scenario(_Strict):
     gps: GpsSetup = GpsSetup()
     compass: CompassSetup = CompassSetup()
     laser: LaserSetup | None = None
+    obstacles: tuple[ObstacleSetup, ...] = Field(
+        default=(), max_length=48, description="what stands there, besides the site's own"
+    )
+    field: FieldSetup | None = Field(default=None, description="boxes drawn from the seed")
     actors: tuple[ActorSetup, ...] = Field(default=(), max_length=8)
     faults: tuple[FaultSetup, ...] = ()
     duration_s: float = Field(gt=0.0, le=3600.0)

@@ -19,10 +19,9 @@ from .actors import Actor
 from .compass_error import CompassError, CompassParams, declination_rad
 from .compiled import CompiledPlant
 from .gps_error import GPS_GRADES, GpsError, GpsGrade
-from .laser import PERIOD_NS as LASER_NS
-from .laser import Laser, LaserParams
 from .plant import CartParams, CartState, Demand, Plant, PythonPlant
 from .site import Site, scene_of
+from .synlaser import SynLaser, SynLaserParams
 from .terrain import Terrain
 from .world import World
 
@@ -101,7 +100,7 @@ class SimSetup:
     compass_factor: float = 1.0
     outages: tuple[Outage, ...] = ()
     compass: str | None = "hmr3000"
-    laser: LaserParams | None = None
+    laser: SynLaserParams | None = None
     actors: tuple[Actor, ...] = field(default=())
 
 
@@ -147,7 +146,7 @@ class SimCart:
         self.scene: Scene = scene_of(setup.site, heights)
         self._owns_world = make_world is None
         self.world = (make_world or World)(self.scene) if boxes or setup.actors or setup.laser else None
-        self._laser = Laser(self.world, setup.laser, rng("laser")) if self.world and setup.laser else None
+        self._laser = SynLaser(self.world, setup.laser, rng("laser")) if self.world and setup.laser else None
         self.add_actors()
         self._demand = Demand(brake=PARK_EFFORT)
         self._nearest, self._far = Clearance(), False
@@ -162,38 +161,42 @@ class SimCart:
 
     def advance(self, tick_ns: int) -> None:
         """Advance by one tick: physics under the present demand, then sensors and nodes at the new time."""
-        s = self.plant.state
-        ground = self.terrain.ground(s.x_m, s.y_m)
+        plant, demand, terrain = self.plant, self._demand, self.terrain
+        ground = terrain.flat
+        if ground is None:
+            s = plant.state
+            ground = terrain.ground(s.x_m, s.y_m)
         for _ in range(tick_ns // STEP_NS):
-            self.plant.step(self._demand, ground)
-        self.t_ns += tick_ns
-        t_ns, s = self.t_ns, self.plant.state
-        if t_ns % NODE_NS == 0:
+            plant.step(demand, ground)
+        self.t_ns = t_ns = self.t_ns + tick_ns
+        nodes_due = t_ns % NODE_NS == 0
+        if nodes_due:
+            s = plant.state
             self.odometry.poll(t_ns, s.left_travel_m, s.right_travel_m)
         self.safety.poll(t_ns, (self.odometry.left + self.odometry.right) // 2, self.estop_button)
-        if t_ns % NODE_NS == 0:
-            self.steer.poll(t_ns, s.steer_rad, 0.0)
-            self.brake.poll(t_ns, s.brake, 0.0)
-            self.drive.poll(t_ns, s.vx_mps, s.drive, 0.0)
-            self._demand = Demand(
-                self.steer.target_rad, self.brake.effort, self.drive.output, self.drive.contactor_open
-            )
+        if nodes_due:
+            self._poll_actuators(t_ns, s)
         if self.gps.due(t_ns):
-            self._measure_gps(t_ns, s)
+            self._measure_gps(t_ns, plant.state)
         if self.compass is not None and self.compass.due(t_ns):
-            self._measure_heading(t_ns, s)
-        if self.world is not None:
-            self._move_world(self.world, t_ns, s)
+            self._measure_heading(t_ns, plant.state)
+        if self.world is not None and (t_ns % CLEARANCE_NS == 0 or not self._far):
+            self._move_world(self.world, t_ns, plant.state)
+
+    def _poll_actuators(self, t_ns: int, s: CartState) -> None:
+        self.steer.poll(t_ns, s.steer_rad, 0.0)
+        self.brake.poll(t_ns, s.brake, 0.0)
+        self.drive.poll(t_ns, s.vx_mps, s.drive, 0.0)
+        self._demand = Demand(self.steer.target_rad, self.brake.effort, self.drive.output, self.drive.contactor_open)
 
     def _move_world(self, world: World, t_ns: int, s: CartState) -> None:
-        check = t_ns % CLEARANCE_NS == 0
-        if not check and self._far:
-            return  # nothing can be reached before the next look
+        """Put cart and walkers in their places and look how near they are. Far away, only from look to look."""
         world.move_cart(s.x_m, s.y_m, self.terrain.height_m(s.x_m, s.y_m), s.yaw_rad)
         for k, actor in enumerate(self.setup.actors):
             x_m, y_m, _ = actor.at(t_ns)
             world.move_actor(k, x_m, y_m, self.terrain.height_m(x_m, y_m))
-        if (world.touches() and not self._nearest.collided) or check:
+        touched = not self._far and world.touches() and not self._nearest.collided
+        if touched or t_ns % CLEARANCE_NS == 0:
             now = world.clearance()
             self._far = now.distance_m > FAR_M
             if now.collided > self._nearest.collided or now.distance_m <= self._nearest.distance_m:
@@ -244,7 +247,7 @@ class SimCart:
 
     def scan(self) -> Scan | None:
         """Scan, when it is time to; None in between, or without a scanner."""
-        if self._laser is None or self.t_ns % LASER_NS:
+        if self._laser is None or not self._laser.due(self.t_ns):
             return None
         s = self.plant.state
         return self._laser.scan(s.x_m, s.y_m, self.terrain.height_m(s.x_m, s.y_m), s.yaw_rad)

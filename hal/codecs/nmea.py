@@ -11,9 +11,10 @@ all follow that table: `quantise(s)` is what `parse(format(s))` gives, to the la
 """
 
 import re
-from functools import reduce
+from collections.abc import Callable, Hashable
+from functools import cache, lru_cache, reduce
 from operator import xor
-from typing import Any, ClassVar, Final, Protocol, TypeVar
+from typing import Any, ClassVar, Final, NoReturn, Protocol, TypeVar
 
 import msgspec
 
@@ -57,7 +58,7 @@ class SentenceError(CodecError):
 # ---- columns: how a value stands between commas --------------------------------------------------
 
 
-class Column(Protocol):
+class Column(Hashable, Protocol):
     """One value of a sentence: its attribute and the fields that it fills.
 
     The three methods take and give None for "unknown" and raise ValueError for what cannot be.
@@ -83,13 +84,16 @@ _is_magnitude: Final = re.compile(r"[0-9]+\.?[0-9]*|\.[0-9]+").fullmatch
 _is_integer: Final = re.compile(r"-?[0-9]+").fullmatch
 _is_clock: Final = re.compile(r"([01][0-9]|2[0-3])([0-5][0-9])([0-5][0-9]|60)(\.[0-9]*)?").fullmatch
 _is_date: Final = re.compile(r"(0[1-9]|[12][0-9]|3[01])(0[1-9]|1[0-2])([0-9]{2})").fullmatch
-_is_text: Final = re.compile(r"[A-Za-z0-9]{1,4}").fullmatch
 
 
 def _in_range(value: float, lowest: float, highest: float) -> float:
     if not lowest <= value <= highest:  # false for NaN too
-        raise ValueError(f"{value} came, expected {lowest}..{highest}")
+        _refuse(value, lowest, highest)
     return value
+
+
+def _refuse(value: float, lowest: float, highest: float) -> NoReturn:
+    raise ValueError(f"{value} came, expected {lowest}..{highest}")
 
 
 class _Number:
@@ -101,7 +105,7 @@ class _Number:
         self.name = name
         self._decimals = decimals
         self._format = f"%.{decimals}f"
-        self._range = lowest, highest
+        self._lowest, self._highest = lowest, highest
 
     def read(self, fields: list[str], at: int) -> float | None:
         text = fields[at]
@@ -109,7 +113,7 @@ class _Number:
             return None
         if not _is_number(text):
             raise ValueError(f"{text!r} came, expected a number")
-        return _in_range(float(text), *self._range) + 0.0  # + 0.0: no negative zero
+        return _in_range(float(text), self._lowest, self._highest) + 0.0  # + 0.0: no negative zero
 
     def write(self, value: float | None) -> str:
         return "" if value is None else self._format % self.quantise(value)
@@ -117,8 +121,10 @@ class _Number:
     def quantise(self, value: float | None) -> float | None:
         if value is None:
             return None
+        if not self._lowest <= value <= self._highest:
+            _refuse(value, self._lowest, self._highest)
         # round() gives the float nearest to the decimal text, as float(text) does
-        return round(_in_range(value, *self._range), self._decimals) + 0.0
+        return round(value, self._decimals) + 0.0
 
 
 class _Course(_Number):
@@ -208,7 +214,9 @@ class _Angle:
         return sign * units / (60 * scale)
 
     def _units(self, value: float) -> int:
-        return round(_in_range(value, -self._limit, self._limit) * self._UNITS)
+        if not -self._limit <= value <= self._limit:
+            _refuse(value, -self._limit, self._limit)
+        return round(value * self._UNITS)
 
     def write(self, value: float | None) -> str:
         if value is None:
@@ -240,16 +248,20 @@ class _Clock:
     def write(self, value: float | None) -> str:
         if value is None:
             return ""
-        whole, decimals = f"{self.quantise(value):.2f}".split(".")
-        minutes, seconds = divmod(int(whole), 60)
-        if minutes == 24 * 60:
-            return f"235960.{decimals}"
-        return f"{minutes // 60:02d}{minutes % 60:02d}{seconds:02d}.{decimals}"
+        quantised = self.quantise(value)
+        assert quantised is not None
+        seconds, hundredths = divmod(round(quantised * 100.0), 100)
+        if seconds == 86_400:
+            return f"235960.{hundredths:02d}"
+        minutes = seconds // 60
+        return f"{minutes // 60:02d}{minutes % 60:02d}{seconds % 60:02d}.{hundredths:02d}"
 
     def quantise(self, value: float | None) -> float | None:
         if value is None:
             return None
-        return min(round(_in_range(value, 0.0, 86_401.0), 2), 86_400.99) + 0.0
+        if not 0.0 <= value <= 86_401.0:
+            _refuse(value, 0.0, 86_401.0)
+        return min(round(value, 2), 86_400.99) + 0.0
 
 
 def _ddmmyy(date: tuple[int, int, int]) -> str:
@@ -268,8 +280,12 @@ class _Date:
         return None if match is None else (int(match[1]), int(match[2]), int(match[3]))
 
     def write(self, value: tuple[int, int, int] | None) -> str:
-        checked = self.quantise(value)
-        return "" if checked is None else _ddmmyy(checked)
+        if value is None:
+            return ""
+        text = _ddmmyy(value)
+        if not _is_date(text):
+            self.quantise(value)
+        return text
 
     def quantise(self, value: tuple[int, int, int] | None) -> tuple[int, int, int] | None:
         if value is not None and not _is_date(_ddmmyy(value)):
@@ -350,7 +366,7 @@ class _Text:
     def quantise(self, value: str | None) -> str | None:
         if not value:
             return None
-        if not _is_text(value):
+        if len(value) > 4 or not value.isalnum() or not value.isascii():
             raise ValueError(f"{value!r} came, expected at most four letters or digits")
         return value
 
@@ -746,6 +762,10 @@ class _Layout(msgspec.Struct, frozen=True):
     """Name, index of the first field, column."""
     most: int
     """How many fields there are with all optional ones."""
+    texts: Callable[[Any], tuple[str, ...]]
+    """The texts of a sentence, its address first."""
+    rounded: Callable[[Any], Any]
+    """The sentence with every value as it comes back from its text."""
 
 
 def _layout(sentence: type[Sentence]) -> _Layout:
@@ -753,7 +773,34 @@ def _layout(sentence: type[Sentence]) -> _Layout:
     for column in sentence.COLUMNS:
         columns.append((column.name, at, column))
         at += column.width
-    return _Layout(sentence, tuple(columns), at)
+    return _Layout(sentence, tuple(columns), at, *_written_out(sentence))
+
+
+def _written_out(sentence: type[Sentence]) -> tuple[Callable[[Any], tuple[str, ...]], Callable[[Any], Any]]:
+    """Write the loops over the columns out as Python source: half the time. For HDT the two functions read:
+
+    lambda s: (s.talker + 'HDT', write0(s.heading_deg), 'T')
+    lambda s: Sentence(talker=s.talker, heading_deg=quantise0(s.heading_deg))
+    """
+    scope: dict[str, Any] = {"Sentence": sentence}
+    texts, values = [f"s.talker + {sentence.TYPE!r}"], ["talker=s.talker"]
+    for k, column in enumerate(sentence.COLUMNS):
+        if column.name:
+            scope[f"write{k}"], scope[f"quantise{k}"] = _remembering(column)
+            texts.append(f"write{k}(s.{column.name})")
+            values.append(f"{column.name}=quantise{k}(s.{column.name})")
+        else:
+            texts.append(repr(column.write(None)))
+    return (
+        eval(f"lambda s: ({', '.join(texts)})", scope),
+        eval(f"lambda s: Sentence({', '.join(values)})", scope),
+    )
+
+
+@cache
+def _remembering(column: Column) -> tuple[Callable[[Any], str], Callable[[Any], Any]]:
+    """Give the column's `write` and `quantise`, which know their latest answers: a burst says most values twice."""
+    return lru_cache(32, typed=True)(column.write), lru_cache(32, typed=True)(column.quantise)
 
 
 _LAYOUTS: Final = {sentence.TYPE: _layout(sentence) for sentence in SENTENCES}
@@ -767,7 +814,7 @@ def checksum(body: bytes) -> int:
 def frame(body: str) -> bytes:
     """Return a body, for instance a query like `TNHCQ,HDG`, as a line with `$`, checksum, CR LF."""
     data = body.encode("ascii")
-    return b"$%b*%02X\r\n" % (data, reduce(xor, data, 0))
+    return b"$%b*%02X\r\n" % (data, checksum(data))
 
 
 def parse(line: bytes) -> Sentence | None:
@@ -781,7 +828,7 @@ def parse(line: bytes) -> Sentence | None:
     body, given = match.groups()
     if len(body) > MAX_LENGTH - 4:
         raise SentenceError(f"{line[:MAX_LENGTH]!r}...: {len(body) + 4} bytes, expected at most {MAX_LENGTH}")
-    expected = reduce(xor, body)
+    expected = checksum(body)
     if int(given, 16) != expected:
         raise SentenceError(f"{line!r}: checksum {given.decode()}, expected {expected:02X}")
     address, *fields = body.decode("ascii").split(",")
@@ -809,6 +856,7 @@ def parse(line: bytes) -> Sentence | None:
     return layout.sentence(**values)
 
 
+@lru_cache(maxsize=64)
 def _may_say(talker: str, sentence: type[Sentence]) -> bool:
     return _is_talker(talker) is not None if sentence.OWN_TALKER is None else talker == sentence.OWN_TALKER
 
@@ -816,13 +864,10 @@ def _may_say(talker: str, sentence: type[Sentence]) -> bool:
 def format(sentence: Sentence) -> bytes:
     """Return a sentence as a line with `$`, checksum, CR LF. SentenceError if a value cannot be written."""
     layout = _checked_layout(sentence)
-    texts = [sentence.talker + sentence.TYPE]
-    name = ""
     try:
-        for name, _, column in layout.columns:
-            texts.append(column.write(getattr(sentence, name) if name else None))
-    except ValueError as error:
-        raise SentenceError(f"{texts[0]} {name}: {error}") from error
+        texts = layout.texts(sentence)
+    except ValueError:
+        raise _refused(sentence, layout) from None
     if isinstance(sentence, Os5000):
         return frame("".join(letter + text for letter, text in zip(("", "", *"PRT"), texts, strict=True) if text))
     body = ",".join(texts)
@@ -836,15 +881,21 @@ _S = TypeVar("_S", bound=Sentence)
 
 def quantise(sentence: _S) -> _S:
     """Return the sentence as `parse(format(sentence))` gives it, to the last bit."""
-    values: dict[str, Any] = {"talker": sentence.talker}
-    name = ""
+    layout = _checked_layout(sentence)
     try:
-        for name, _, column in _checked_layout(sentence).columns:
-            if name:
-                values[name] = column.quantise(getattr(sentence, name))
-    except ValueError as error:
-        raise SentenceError(f"{sentence.talker}{sentence.TYPE} {name}: {error}") from error
-    return type(sentence)(**values)
+        return layout.rounded(sentence)  # type: ignore[no-any-return]
+    except ValueError:
+        raise _refused(sentence, layout) from None
+
+
+def _refused(sentence: Sentence, layout: _Layout) -> SentenceError:
+    """Say which value of a sentence cannot be."""
+    for name, _, column in layout.columns:
+        try:
+            column.quantise(getattr(sentence, name) if name else None)
+        except ValueError as error:
+            return SentenceError(f"{sentence.talker}{sentence.TYPE} {name}: {error}")
+    raise AssertionError(f"{sentence!r} can be written")
 
 
 def _checked_layout(sentence: Sentence) -> _Layout:

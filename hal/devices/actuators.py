@@ -23,11 +23,16 @@ from hal.codecs.cartcan import (
 )
 from hal.signals import SystemState, state_of
 
-from .watch import GOOD_BEFORE_ENABLE, CommandWatch
+from .watch import GOOD_BEFORE_ENABLE, NEVER_NS, CommandWatch
 
 COMMAND_TIMEOUT_NS = 100_000_000
 SAFETY_TIMEOUT_NS = 250_000_000
 REPORT_NS = 20_000_000
+# Looked up once: in Python 3.11 a member of an enum costs three times what the comparison with it does.
+INIT, READY, ENABLED = SystemState.INIT, SystemState.READY, SystemState.ENABLED
+OVERRIDE, MANUAL, ESTOP = SystemState.OVERRIDE, SystemState.MANUAL, SystemState.ESTOP
+ANGLE, PERCENT, SPEED = SteerMode.ANGLE, ThrottleMode.PERCENT, ThrottleMode.SPEED
+FORWARD, REVERSE = Direction.FORWARD, Direction.REVERSE
 
 
 class Node:
@@ -38,45 +43,42 @@ class Node:
     def __init__(self, bus: CanBus, name: str) -> None:
         self.port: CanPort = bus.port(name, [self.command, SystemRpt, Estop])
         self.watch = CommandWatch(COMMAND_TIMEOUT_NS)
-        self.state = SystemState.INIT
+        self.state = INIT
         self.estop = False
         self.enabled = False
         self._armed = False  # enough idle frames came before the enable bit
-        self._safety_ns: int | None = None
+        self._trusted_until_ns = NEVER_NS  # later than that, the safety node is silent
         self._asked: Message | None = None
 
     def _listen(self, t_ns: int) -> None:
         for received in self.port.receive():
+            message = received.message
             if received.frame_id == self.command.ID:
                 self._obey(received)
-            elif isinstance(received.message, SystemRpt):
-                self.state, self._safety_ns = state_of(received.message.state), received.t_ns
-            elif isinstance(received.message, Estop):
-                self.estop = bool(received.message.active)
-        asked = self._asked is not None and bool(getattr(self._asked, "enable", 0))
-        watched = self._safety_ns is not None and t_ns - self._safety_ns <= SAFETY_TIMEOUT_NS
-        was, self.enabled = (
-            self.enabled,
-            (
-                asked
-                and self._armed
-                and watched
-                and self.state is SystemState.ENABLED
-                and not self.estop
-                and not self.watch.silent(t_ns)
-                and not self.watch.tripped
-            ),
+            elif isinstance(message, SystemRpt):
+                self.state, self._trusted_until_ns = state_of(message.state), received.t_ns + SAFETY_TIMEOUT_NS
+            elif isinstance(message, Estop):
+                self.estop = bool(message.active)
+        was, watch = self.enabled, self.watch
+        self.enabled = (
+            watch.asks
+            and self._armed
+            and self.state is ENABLED
+            and not self.estop
+            and not watch.tripped
+            and t_ns <= watch.fresh_until_ns
+            and t_ns <= self._trusted_until_ns
         )
         if was and not self.enabled:
             self._armed = False  # a stop is not taken back by frames that come again: idle ones come first
-        if self.state is SystemState.READY and not asked:
-            self.watch.forgive()
+        if self.state is READY and not watch.asks:
+            watch.forgive()
 
     def _obey(self, received: Received) -> None:
         idle = self.watch.idle_streak
         message = self.watch.judge(received)
         if message is not None:
-            if not getattr(message, "enable", 0):
+            if not self.watch.asks:
                 self._armed = False
             elif idle >= GOOD_BEFORE_ENABLE:
                 self._armed = True
@@ -100,9 +102,9 @@ class SteerNode(Node):
         """Act on what came; report when due."""
         was = self.enabled
         self._listen(t_ns)
-        if self.state is SystemState.OVERRIDE or (self.enabled and not was):
+        if self.state is OVERRIDE or (self.enabled and not was):
             self.target_rad = angle_rad  # released, or: nothing jumps on entry
-        elif self.enabled and isinstance(self._asked, SteerCmd) and self._asked.mode == SteerMode.ANGLE:
+        elif self.enabled and isinstance(self._asked, SteerCmd) and self._asked.mode == ANGLE:
             self.target_rad = self._asked.angle_rad
         if t_ns % REPORT_NS == 0:
             self.port.send(
@@ -111,7 +113,7 @@ class SteerNode(Node):
                     angle_cmd_rad=self.target_rad,
                     driver_torque_nm=driver_torque_nm,
                     enabled=self.enabled,
-                    override=self.state is SystemState.OVERRIDE,
+                    override=self.state is OVERRIDE,
                     timeout=self.watch.silent(t_ns),
                     homed=True,
                     cmd_rejected=self._take_rejected(),
@@ -136,13 +138,13 @@ class BrakeNode(Node):
         self._listen(t_ns)
         dt_s = 0.0 if self._polled_ns is None else (t_ns - self._polled_ns) * 1e-9
         self._polled_ns = t_ns
-        if self.estop or self.state is SystemState.ESTOP:
+        if self.estop or self.state is ESTOP:
             self.effort = 1.0
-        elif self.state in (SystemState.OVERRIDE, SystemState.MANUAL):
+        elif self.state is OVERRIDE or self.state is MANUAL:
             self.effort = 0.0
         elif self.enabled and isinstance(self._asked, BrakeCmd):
             self.effort = self._asked.effort_ratio
-        elif self.state in (SystemState.INIT, SystemState.READY):
+        elif self.state is READY or self.state is INIT:
             self.effort = self._park_effort
         else:  # stopping or fault, or the host or the safety node fell silent
             step = self._ramp_per_s * dt_s
@@ -154,7 +156,7 @@ class BrakeNode(Node):
                     effort_cmd_ratio=self.effort,
                     pedal_ratio=pedal,
                     enabled=self.enabled,
-                    override=self.state is SystemState.OVERRIDE,
+                    override=self.state is OVERRIDE,
                     timeout=self.watch.silent(t_ns),
                     cmd_rejected=self._take_rejected(),
                 ),
@@ -186,21 +188,21 @@ class DriveNode(Node):
         self._listen(t_ns)
         dt_s = 0.0 if self._polled_ns is None else (t_ns - self._polled_ns) * 1e-9
         self._polled_ns = t_ns
-        self.contactor_open = self.estop or self.state is SystemState.ESTOP
+        self.contactor_open = self.estop or self.state is ESTOP
         if self.enabled and isinstance(self._asked, ThrottleCmd):
             self.output = self._drive(self._asked, speed_mps, dt_s)
         else:
             self.output = self._integral = 0.0
             self._ramp_mps = speed_mps
         if t_ns % REPORT_NS == 0:
-            direction = Direction.REVERSE if self.output < 0 else Direction.FORWARD
+            direction = REVERSE if self.output < 0 else FORWARD
             self.port.send(
                 ThrottleRpt.of(
                     output_ratio=output,
                     cmd_ratio=self.output,
                     pedal_ratio=pedal,
                     enabled=self.enabled,
-                    override=self.state is SystemState.OVERRIDE,
+                    override=self.state is OVERRIDE,
                     timeout=self.watch.silent(t_ns),
                     direction=direction,
                     cmd_rejected=self._take_rejected(),
@@ -209,10 +211,10 @@ class DriveNode(Node):
             )
 
     def _drive(self, asked: ThrottleCmd, speed_mps: float, dt_s: float) -> float:
-        if asked.mode == ThrottleMode.PERCENT:
+        if asked.mode == PERCENT:
             return min(max(asked.percent_ratio or 0.0, -1.0), 1.0)
         wanted = asked.speed_mps
-        if asked.mode != ThrottleMode.SPEED or not wanted:
+        if asked.mode != SPEED or not wanted:
             self._integral, self._ramp_mps = 0.0, speed_mps
             return 0.0
         rise, before_mps = (asked.accel_limit_mps2 or 1.0) * dt_s, self._ramp_mps

@@ -11,8 +11,9 @@ are made here. Level wire gives bytes, level direct gives the same sentences rou
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final, Literal
+
+import msgspec
 
 from hal.codecs import nmea
 from hal.codecs.nmea import Hdg, Hdt, Hpr, Ohpr, Os5000, Sentence
@@ -88,8 +89,7 @@ class Compass(Talker):
 # ---- what the sentences say --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Measurement:
+class _Measurement(msgspec.Struct, frozen=True, gc=False):
     """One measurement in the units of NMEA."""
 
     heading_deg: float

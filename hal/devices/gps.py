@@ -11,9 +11,10 @@ are made here. Level wire gives bytes, level direct gives the same sentences rou
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from datetime import date
 from typing import Final, Literal
+
+import msgspec
 
 from hal.codecs import nmea
 from hal.codecs.nmea import Gga, Gll, Gsa, Gst, Rmc, Sentence, Vtg, Zda
@@ -68,7 +69,7 @@ class GpsReceiver(Talker):
         self._writers = [_WRITERS[name] for name in sentences]
         self._talker = talker
         self._variation_deg = None if variation_rad is None else math.degrees(variation_rad)
-        longest = _LONGEST if variation_rad is not None else replace(_LONGEST, variation_deg=None)
+        longest = _LONGEST if variation_rad is not None else msgspec.structs.replace(_LONGEST, variation_deg=None)
         self.refuse_if_too_long(sum(len(nmea.format(write(talker, longest))) for write in self._writers))
 
     def measure(
@@ -123,8 +124,7 @@ class GpsReceiver(Talker):
 # ---- what the sentences say --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Measurement:
+class _Measurement(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """One measurement in the units of NMEA but for the speed; None is what the receiver does not know."""
 
     valid: bool

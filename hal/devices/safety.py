@@ -6,10 +6,11 @@ count of wheel ticks, the driver's pedals. The rules and their sources stand in 
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
-from hal.bus import CanBus
+from hal.bus import CanBus, Received
 from hal.codecs.cartcan import (
     BrakeCmd,
     BrakeRpt,
@@ -38,6 +39,7 @@ TORQUE_OVERRIDE_NS = 100_000_000
 OVERSPEED_NS = 100_000_000
 REPORT_NS = 50_000_000
 ESTOP_NS = 100_000_000
+NOTHING_ASKED = SystemCmd()
 
 
 class FaultCode(IntEnum):
@@ -51,6 +53,12 @@ class FaultCode(IntEnum):
     OVERSPEED = 5
     CORNERING = 6
     DISABLED_MOVING = 7
+
+
+# Looked up once: in Python 3.11 a member of an enum costs three times what the comparison with it does.
+INIT, READY, ENABLED = SystemState.INIT, SystemState.READY, SystemState.ENABLED
+OVERRIDE, STOPPING, ESTOP = SystemState.OVERRIDE, SystemState.STOPPING, SystemState.ESTOP
+NO_FAULT = FaultCode.NONE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,10 +77,19 @@ class SafetyNode:
     def __init__(self, bus: CanBus, t_ns: int, params: SafetyParams | None = None) -> None:
         self.port = bus.port("SAFETY", [SystemCmd, SteerCmd, BrakeCmd, ThrottleCmd, SteerRpt, BrakeRpt, ThrottleRpt])
         self.params = params or SafetyParams()
-        self.state = SystemState.INIT
-        self.fault = FaultCode.NONE
+        self.state = INIT
+        self.fault = NO_FAULT
         self._commands = {m.ID: CommandWatch(ACTUATOR_TIMEOUT_NS) for m in (SteerCmd, BrakeCmd, ThrottleCmd)}
         self._system = CommandWatch(SYSTEM_TIMEOUT_NS)
+        self._actuator_watches = tuple(self._commands.values())
+        self._watches = (*self._actuator_watches, self._system)
+        self._hear: dict[int, Callable[[Received, int], None]] = {
+            **dict.fromkeys(self._commands, self._hear_command),
+            SystemCmd.ID: self._hear_system,
+            SteerRpt.ID: self._hear_steer,
+            BrakeRpt.ID: self._hear_brake,
+            ThrottleRpt.ID: self._hear_throttle,
+        }
         self._asked = SystemCmd()
         self._request_ns: int | None = None  # since when SYSTEM_CMD asks to enable
         self._enable_ns: dict[int, int] = {}  # since when each command asks to be obeyed, after enough idle frames
@@ -80,11 +97,11 @@ class SafetyNode:
         self._cycle, self._cycle_ns = -1, t_ns
         self._ticks, self._moved_ns, self._still_since_ns = 0, t_ns, t_ns
         self._speeds: deque[tuple[int, int]] = deque(maxlen=11)
-        self._steer_rad = 0.0
+        self._steer_tan = 0.0  # tangent of the steering angle, without its sign
         self._torque_since_ns: int | None = None
         self._overspeed_since_ns: int | None = None
         self._free_since_ns = t_ns
-        self._override = (False, False, False)
+        self._override = [False, False, False]  # the driver steers, brakes, drives
         self._stopping_ns = t_ns
         self._estop_source = EstopSource.NONE
         self._estop_sent = False
@@ -93,20 +110,20 @@ class SafetyNode:
 
     def poll(self, t_ns: int, ticks: int, button: bool) -> None:
         """Hear, decide, report. ticks: the node's own wheel count; button: the emergency stop button is pressed."""
-        self._move(t_ns, ticks)
-        self._hear(t_ns)
+        if ticks != self._ticks:
+            self._ticks, self._moved_ns = ticks, t_ns
+        self._speeds.append((t_ns, ticks))
+        for received in self.port.receive():
+            self._hear[received.frame_id](received, t_ns)
+        if True in self._override:
+            self._free_since_ns = t_ns
         was, self.state = self.state, self._decide(t_ns, button)
-        estop = self.state is SystemState.ESTOP
+        estop = self.state is ESTOP
         if estop != self._estop_sent or t_ns % ESTOP_NS == 0:
             self._estop_sent = estop
             self.port.send(Estop(active=estop, source=self._estop_source, latched=estop), t_ns)
         if self.state is not was or t_ns % REPORT_NS == 0:  # a change is told at once, like an emergency stop
             self._report(t_ns)
-
-    def _move(self, t_ns: int, ticks: int) -> None:
-        if ticks != self._ticks:
-            self._ticks, self._moved_ns = ticks, t_ns
-        self._speeds.append((t_ns, ticks))
 
     @property
     def speed_mps(self) -> float:
@@ -114,34 +131,37 @@ class SafetyNode:
         (t0, n0), (t1, n1) = self._speeds[0], self._speeds[-1]
         return (n1 - n0) * self.params.metres_per_tick / ((t1 - t0) * 1e-9) if t1 > t0 else 0.0
 
-    def _hear(self, t_ns: int) -> None:
-        pedals = list(self._override)
-        for received in self.port.receive():
-            if received.frame_id == SystemCmd.ID:
-                message = self._system.judge(received)
-                if isinstance(message, SystemCmd):
-                    self._take(message, received.t_ns)
-            elif received.frame_id in self._commands:
-                watch = self._commands[received.frame_id]
-                idle = watch.idle_streak
-                message = watch.judge(received)
-                if message is None or not getattr(message, "enable", 0):
-                    if message is not None:
-                        self._enable_ns.pop(received.frame_id, None)
-                elif idle >= GOOD_BEFORE_ENABLE:
-                    self._enable_ns.setdefault(received.frame_id, received.t_ns)
-            elif isinstance(received.message, SteerRpt):
-                self._steer_rad = received.message.angle_rad or 0.0
-                strong = abs(received.message.driver_torque_nm or 0.0) > 3.0
-                self._torque_since_ns = (self._torque_since_ns or received.t_ns) if strong else None
-                pedals[0] = self._torque_since_ns is not None and t_ns - self._torque_since_ns >= TORQUE_OVERRIDE_NS
-            elif isinstance(received.message, BrakeRpt):
-                pedals[1] = (received.message.pedal_ratio or 0.0) > 0.10
-            elif isinstance(received.message, ThrottleRpt):
-                pedals[2] = (received.message.pedal_ratio or 0.0) > 0.05
-        self._override = (pedals[0], pedals[1], pedals[2])
-        if any(pedals):
-            self._free_since_ns = t_ns
+    def _hear_command(self, received: Received, _t_ns: int) -> None:
+        """Note since when a command asks to be obeyed: after enough idle frames."""
+        frame_id = received.frame_id
+        watch = self._commands[frame_id]
+        idle = watch.idle_streak
+        if watch.judge(received) is None:
+            return
+        if not watch.asks:
+            self._enable_ns.pop(frame_id, None)
+        elif idle >= GOOD_BEFORE_ENABLE:
+            self._enable_ns.setdefault(frame_id, received.t_ns)
+
+    def _hear_system(self, received: Received, _t_ns: int) -> None:
+        message = self._system.judge(received)
+        if isinstance(message, SystemCmd):
+            self._take(message, received.t_ns)
+
+    def _hear_steer(self, received: Received, t_ns: int) -> None:
+        if isinstance(message := received.message, SteerRpt):
+            self._steer_tan = abs(math.tan(message.angle_rad or 0.0))
+            strong = abs(message.driver_torque_nm or 0.0) > 3.0
+            since_ns = self._torque_since_ns = (self._torque_since_ns or received.t_ns) if strong else None
+            self._override[0] = since_ns is not None and t_ns - since_ns >= TORQUE_OVERRIDE_NS
+
+    def _hear_brake(self, received: Received, _t_ns: int) -> None:
+        if isinstance(message := received.message, BrakeRpt):
+            self._override[1] = (message.pedal_ratio or 0.0) > 0.10
+
+    def _hear_throttle(self, received: Received, _t_ns: int) -> None:
+        if isinstance(message := received.message, ThrottleRpt):
+            self._override[2] = (message.pedal_ratio or 0.0) > 0.05
 
     def _take(self, message: SystemCmd, t_ns: int) -> None:
         if not message.request_enable:
@@ -149,7 +169,7 @@ class SafetyNode:
         elif not self._asked.request_enable:
             self._request_ns = t_ns
         ahead = (message.cycle - self._cycle) & 0xFFFFFFFF  # while enabled, only forward counts as advancing
-        if self.state is not SystemState.ENABLED or 0 < ahead < 1 << 31:
+        if self.state is not ENABLED or 0 < ahead < 1 << 31:
             self._cycle, self._cycle_ns = message.cycle, t_ns
         self._asked = message
 
@@ -157,37 +177,37 @@ class SafetyNode:
 
     def _decide(self, t_ns: int, button: bool) -> SystemState:
         state = self.state
-        asked = SystemCmd() if self._system.silent(t_ns) else self._asked  # a dead host clears nothing
-        if state is SystemState.ESTOP:
+        asked = NOTHING_ASKED if t_ns > self._system.fresh_until_ns else self._asked  # a dead host clears nothing
+        if state is ESTOP:
             released = not button and not asked.request_estop and asked.clear_faults
             return self._ready() if released else state
         if button or asked.request_estop:
             self._estop_source = EstopSource.BUTTON if button else EstopSource.HOST
-            return SystemState.ESTOP
-        if state is SystemState.OVERRIDE:
+            return ESTOP
+        if state is OVERRIDE:
             free = t_ns - self._free_since_ns >= OVERRIDE_FREE_NS
-            cleared = self.fault is FaultCode.NONE or asked.clear_faults  # a fault from before is still latched
+            cleared = self.fault is NO_FAULT or asked.clear_faults  # a fault from before is still latched
             return self._ready() if free and asked.clear_override and cleared else state
-        if any(self._override):
-            return SystemState.OVERRIDE
-        if state is SystemState.INIT:
+        if True in self._override:
+            return OVERRIDE
+        if state is INIT:
             return self._ready() if t_ns >= self._booted_ns else state
-        if state is SystemState.READY:
+        if state is READY:
             return self._enter(t_ns) if self._may_enable(t_ns) else state
-        if state is SystemState.ENABLED:
+        if state is ENABLED:
             return self._stay_enabled(t_ns)
-        if state is SystemState.STOPPING:
+        if state is STOPPING:
             still = t_ns - max(self._moved_ns, self._stopping_ns) >= STANDSTILL_NS + FAULT_AFTER_NS
             return SystemState.FAULT if still else state
         return self._ready() if state is SystemState.FAULT and asked.clear_faults else state
 
     def _ready(self) -> SystemState:
-        self.fault, self._estop_source = FaultCode.NONE, EstopSource.NONE
+        self.fault, self._estop_source = NO_FAULT, EstopSource.NONE
         self._enable_ns.clear()
         self._request_ns = None
-        for watch in (*self._commands.values(), self._system):
+        for watch in self._watches:
             watch.forgive()
-        return SystemState.READY
+        return READY
 
     def _may_enable(self, t_ns: int) -> bool:
         asks = [self._request_ns] if self._request_ns is not None and not self._system.silent(t_ns) else []
@@ -197,47 +217,44 @@ class SafetyNode:
     def _enter(self, t_ns: int) -> SystemState:
         self._cycle_ns = t_ns
         self._overspeed_since_ns = None
-        return SystemState.ENABLED
+        return ENABLED
 
     def _stay_enabled(self, t_ns: int) -> SystemState:
         if not self._asked.request_enable and not self._moving(t_ns):
             return self._ready()
         self.fault = self._why_stop(t_ns)
-        if self.fault is FaultCode.NONE:
-            return SystemState.ENABLED
+        if self.fault is NO_FAULT:
+            return ENABLED
         self._stopping_ns = t_ns
-        return SystemState.STOPPING
+        return STOPPING
 
     def _moving(self, t_ns: int) -> bool:
         return t_ns - self._moved_ns < STANDSTILL_NS
 
     def _why_stop(self, t_ns: int) -> FaultCode:
-        watches = (*self._commands.values(), self._system)
         speed_mps = abs(self.speed_mps)
         fast = speed_mps > self.params.max_speed_mps
         self._overspeed_since_ns = (self._overspeed_since_ns or t_ns) if fast else None
-        lateral_mps2 = speed_mps * speed_mps * abs(math.tan(self._steer_rad)) / self.params.wheelbase_m
-        for watch in self._commands.values():
-            if watch.silent(t_ns):
+        for watch in self._actuator_watches:
+            if t_ns > watch.fresh_until_ns:
                 return FaultCode.ACTUATOR_SILENT
-        if self._system.silent(t_ns):
+        if t_ns > self._system.fresh_until_ns:
             return FaultCode.HOST_SILENT
-        for watch in watches:
+        for watch in self._watches:
             if watch.tripped:
                 return FaultCode.BAD_FRAMES
         if t_ns - self._cycle_ns > CYCLE_TIMEOUT_NS:
             return FaultCode.CYCLE_STANDS
         if self._overspeed_since_ns is not None and t_ns - self._overspeed_since_ns >= OVERSPEED_NS:
             return FaultCode.OVERSPEED
-        if lateral_mps2 > self.params.max_lateral_mps2:
+        if speed_mps * speed_mps * self._steer_tan / self.params.wheelbase_m > self.params.max_lateral_mps2:
             return FaultCode.CORNERING
         if not self._asked.request_enable:
             return FaultCode.DISABLED_MOVING
-        return FaultCode.NONE
+        return NO_FAULT
 
     def _report(self, t_ns: int) -> None:
-        watches = (*self._commands.values(), self._system)
-        enabled = self.state is SystemState.ENABLED
+        enabled = self.state is ENABLED
         steer, brake, throttle = self._override
         self.port.send(
             SystemRpt(
@@ -245,13 +262,13 @@ class SafetyNode:
                 steer_enabled=enabled,
                 brake_enabled=enabled,
                 throttle_enabled=enabled,
-                estop=self.state is SystemState.ESTOP,
+                estop=self.state is ESTOP,
                 override_steer=steer,
                 override_brake=brake,
                 override_throttle=throttle,
                 host_timeout=self.fault in (FaultCode.ACTUATOR_SILENT, FaultCode.HOST_SILENT),
-                bad_crc=any(w.bad_crc for w in watches),
-                bad_counter=any(w.bad_counter for w in watches),
+                bad_crc=any(w.bad_crc for w in self._watches),
+                bad_counter=any(w.bad_counter for w in self._watches),
                 key_on=1,
                 fault_code=self.fault,
                 cycle_echo=max(0, self._cycle) & 0xFFFF,

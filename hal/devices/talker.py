@@ -62,7 +62,7 @@ class Talker:
             self._bytes.clear()
             self._sentences.clear()
         if self._direct:
-            complete = []
+            complete: list[Sentence] = []
             while self._sentences and self._sentences[0][0] <= t_ns:
                 complete.append(self._sentences.popleft()[1])
             return complete

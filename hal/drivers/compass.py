@@ -83,6 +83,8 @@ class CompassDriver:
 
     def poll(self, t_ns: int) -> list[tuple[CompassHeading, int]]:
         """Return the readings since the last call, each with its `t_data_ns`, when it was measured."""
+        if not self._finished:
+            return []
         finished, self._finished = self._finished, []
         return finished
 

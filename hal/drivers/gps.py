@@ -126,6 +126,8 @@ class GpsDriver:
     def poll(self, t_ns: int) -> list[tuple[GpsFix, int]]:
         """Return the epochs finished since the last call, each with its `t_data_ns`, when it was measured."""
         self._close_if_quiet(t_ns)
+        if not self._finished:
+            return []
         finished, self._finished = self._finished, []
         return finished
 

@@ -221,3 +221,28 @@ def test_follower_does_the_same_in_two_runs() -> None:
         return [(s.drive, s.state) for s in drive([(15.0, 0.0), (15.0, 15.0)])]
 
     assert told() == told()
+
+
+def test_follower_stands_while_its_course_is_empty_and_drives_a_new_one_from_where_the_cart_is() -> None:
+    geo = [PLANE.to_geo(x, y) for x, y in ((40.0, 0.0), (10.0, 30.0))]
+    courses = [Course((), (), (), 2.0), *(Course((lat,), (lon,), (3.0,), 2.0) for lat, lon in geo)]
+    with Store.create(tick_ns=TICK_NS) as store:
+        store.join("mission").insert("site", Site).write(SITE)
+        route, pose = store.join("plan").insert("route", Course), store.join("localise").insert("pose", Pose)
+        inputs = {"site": "mission/site", "course": "plan/route", "pose": "localise/pose"}
+        host = Host(store, Wire("follow", "autonomy.follow:Follow", 1, 0, inputs), 0)
+        host.connect()
+        drives = store.find("follow/drive", DriveCommand)
+        told = []
+        for course in courses:
+            for _ in range(3):  # the same again changes nothing
+                route.write(course)
+                pose.write(Pose(10.0, 0.0, 0.0, 1.0))
+                host.step(store.tick())
+            store.tick()
+            shown = drives.visible(store.cycle)
+            assert shown is not None
+            told.append(shown.value)
+    assert host.fault == ""
+    assert [drive.speed_mps > 0.0 for drive in told] == [False, True, True]
+    assert [round(drive.steer_rad, 2) for drive in told] == [0.0, 0.0, pytest.approx(0.46)]

@@ -103,7 +103,7 @@ class Synthetic:
         for name, cls in (
             ("localise/pose", Pose),
             ("gps/fix", GpsFix),
-            ("laser/scan", Scan),
+            ("synlaser/scan", Scan),
             ("safety/state", SafetyState),
             ("guard/state", GuardState),
             ("follow/state", FollowState),
@@ -167,7 +167,7 @@ class Synthetic:
             lat_rad, lon_rad = PLANE.to_geo(truth.x_m + 0.8, truth.y_m - 0.5)
             self._write("gps/fix", GpsFix(3, FixQuality.DIFFERENTIAL, lat_rad, lon_rad, sigma_east_m=1.0))
         if n % 10 == 0:
-            self._write("laser/scan", scan_at(truth))
+            self._write("synlaser/scan", scan_at(truth))
             walked = n * TICK_NS * 1e-9
             self._write("world/actors", ActorsTruth((ObstacleKind.PERSON,), (-10.0 + walked,), (10.0,), (0.0,)))
             self._write("world/clearance", Clearance(max(0.0, 5.0 - 0.2 * walked)))
@@ -253,8 +253,8 @@ def test_everything_that_was_recorded_is_an_entity(rrd: Path) -> None:
         "/scene/localise/pose/ellipse",
         "/scene/localise/pose_line",
         "/scene/gps/fix",
-        "/scene/laser/scan",
-        "/scene/laser/scan/rays",
+        "/scene/synlaser/scan",
+        "/scene/synlaser/scan/rays",
         "/signals/localise/pose/error_m",
         "/signals/actuators/command/latency_s",
         "/states/safety/state/state",
@@ -270,7 +270,7 @@ def test_each_write_is_one_row(rrd: Path, recording: Recording) -> None:
         ("world/cart", "/signals/world/cart/speed_mps"),
         ("localise/pose", "/scene/localise/pose/cart"),
         ("gps/fix", "/signals/gps/fix/sigma_east_m"),
-        ("laser/scan", "/signals/laser/scan/max_m"),
+        ("synlaser/scan", "/signals/synlaser/scan/max_m"),
         ("world/actors", "/scene/world/actors"),
     ):
         assert counted[entity] == len(recording.channels[topic].raw), entity

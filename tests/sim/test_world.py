@@ -7,9 +7,9 @@ import pytest
 
 from hal.signals import ObstacleKind
 from sim.actors import Actor
-from sim.laser import MOUNT_X_M, Laser, LaserParams
 from sim.plant import CartParams, CartState, Demand, PythonPlant
 from sim.site import Hill, Lane, Obstacle, Site, kerbs, scene_of
+from sim.synlaser import MOUNT_X_M, SynLaser, SynLaserParams
 from sim.terrain import Terrain
 from sim.world import BODY_LENGTH_M, BODY_REAR_M, World
 
@@ -68,12 +68,12 @@ def test_kerbs_stand_along_the_lane_and_never_inside_it():
         assert abs(abs(inner) - 3.0) < 0.1
 
 
-def test_laser_sees_a_person_where_it_is_and_nothing_else():
+def test_synlaser_sees_a_person_where_it_is_and_nothing_else():
     with World(scene_of(site())) as world:
         world.add_actor(ObstacleKind.PERSON)
         world.move_actor(0, 5.0, 0.0, 0.0)
         world.move_cart(0.0, 0.0, 0.0, 0.0)
-        laser = Laser(world, LaserParams(reach_m=4.0, sigma_m=0.0), np.random.default_rng(0))
+        laser = SynLaser(world, SynLaserParams(reach_m=4.0, sigma_m=0.0), np.random.default_rng(0))
         scan = laser.scan(0.0, 0.0, 0.0, 0.0)
         ahead = round(-scan.first_rad / scan.step_rad)
         assert scan.range_m[ahead] == pytest.approx(5.0 - 0.3 - MOUNT_X_M, abs=0.02)

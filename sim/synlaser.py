@@ -1,4 +1,7 @@
-"""A planar range scanner on the cart's nose, over rays in the world. As in P545, its reach is 4 m by default."""
+"""synlaser: a synthetic planar range scanner on the cart's nose, over rays in the world.
+
+As in P545, its reach is 4 m by default.
+"""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +17,7 @@ PERIOD_NS = 100_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LaserParams:
+class SynLaserParams:
     """The scanner. Noise as of small triangulating scanners (assumption)."""
 
     reach_m: float = 4.0
@@ -23,14 +26,18 @@ class LaserParams:
     sigma_m: float = 0.02
 
 
-class Laser:
+class SynLaser:
     """Scans ten times a second."""
 
-    def __init__(self, world: World, params: LaserParams, rng: np.random.Generator) -> None:
+    def __init__(self, world: World, params: SynLaserParams, rng: np.random.Generator) -> None:
         self._world, self.params, self._rng = world, params, rng
         step = params.fov_rad / (params.rays - 1)
         self._angles = [-params.fov_rad / 2 + k * step for k in range(params.rays)]
         self._step_rad = step
+
+    def due(self, t_ns: int) -> bool:
+        """Say whether a sweep is measured at this time."""
+        return t_ns % PERIOD_NS == 0
 
     def scan(self, x_m: float, y_m: float, z_m: float, yaw_rad: float) -> Scan:
         """Scan from where C stands."""
