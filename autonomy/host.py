@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 HOLD_STEPS = 2
 HISTORY_S = 2.0
 CONFIG_BYTES, SHOW_BYTES = 2000, 2000
+REASON_BYTES = 160  # as ModuleStatus has it
 OWN_FILES = Path(__file__).parent, ("host.py", "module.py")  # their lines tell a student nothing
 FOREVER_NS = 1 << 62
 watch = Watch()
@@ -220,7 +221,7 @@ class Host:
         streams = sys.stdout, sys.stderr
         sys.stdout, sys.stderr = self._streams
         try:
-            watch.begin(self._hang_s)
+            watch.begin(HANG_CPU_S if before is None else self._hang_s)  # a reset may load what it likes
             try:
                 call()
             finally:
@@ -244,11 +245,14 @@ class Host:
         samples.clear()
         for name, port, found, max_age_ns in self._inputs:
             sample: Sample[Any] | None = None
+            why = "is not there yet"
             if found is not None:
-                sample = found.obj.visible_since(cycle, before.get(name))
-            why = ""
+                try:
+                    sample = found.obj.visible_since(cycle, before.get(name))
+                except RtdbError as error:  # aged out, or no JSON: absent as well
+                    why = f"cannot be read: {error}"
             if sample is None:
-                why = "is not there yet"
+                pass
             elif found is not None:
                 age_ns = now_ns - (sample.t_commit_ns if found.json else sample.t_data_ns)
                 if age_ns > max_age_ns:
@@ -306,8 +310,8 @@ class Host:
     def _fail(self, error: BaseException, before: dict[str, Any]) -> None:
         """Stop the module for good."""
         name, cycle = self.wire.component, self._cycle
-        reason = self._reason_of(error)
-        self._say(ModuleState.FAULT, f"cycle {cycle}: {reason}{_where(error, type(self.module))}")
+        reason, where = self._reason_of(error), _where(error, type(self.module))
+        self._say(ModuleState.FAULT, cut(f"cycle {cycle}: {reason}", REASON_BYTES - len(where.encode())) + where)
         self._pending.clear()
         self._miss(self._now_ns)
         log.warning("%s stopped at cycle %d: %s", name, cycle, reason)
@@ -387,8 +391,7 @@ class Host:
             self._status.write(self._told(reason))
 
     def _told(self, reason: str) -> ModuleStatus:
-        cut = reason.encode()[:160].decode(errors="ignore").replace("\0", "")
-        return ModuleStatus(state=self._state, steps=self._steps, reason=cut)
+        return ModuleStatus(state=self._state, steps=self._steps, reason=cut(reason, REASON_BYTES))
 
     def _write_shown(self) -> None:
         document = shown(self.module._shown, SHOW_BYTES)
@@ -401,6 +404,11 @@ class Host:
         over = self._took.over_budget + (took_s > self._budget_s)
         self._took = ModuleTiming(self._took.steps + 1, took_s, max(self._took.longest_s, took_s), over)
         self._timing.write(self._took, self._now_ns)
+
+
+def cut(text: str, n_bytes: int) -> str:
+    """Cut a text so that it fits."""
+    return text.replace("\0", "").encode(errors="replace")[:n_bytes].decode(errors="ignore")
 
 
 def check_names(module: Module) -> None:

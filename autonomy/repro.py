@@ -17,7 +17,7 @@ import msgspec
 from rtdb import Object, Record, RtdbError, Sample
 from rtdb.records import Schema
 
-from .loading import make_module
+from .loading import POLICY, make_module
 from .module import Module, ModuleError
 from .wiring import wire_of
 
@@ -60,6 +60,8 @@ def save(folder: Path, host: "Host", before: dict[str, Any], error: BaseExceptio
 
 
 def _absolute(spec: str) -> str:
+    if spec.endswith(POLICY):
+        return str(Path(spec).resolve())
     place, _, name = spec.rpartition(":")
     return f"{Path(place).resolve()}:{name}" if place.endswith(".py") else spec
 

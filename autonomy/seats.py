@@ -23,6 +23,7 @@ from hal.signals import (
     GpsFix,
     LocalPlane,
     Odometry,
+    PedalCommand,
     Pose,
     SafetyState,
     Scan,
@@ -182,6 +183,24 @@ class DriverSeat(Seat):
         self.drive, self.state = DriveCommand(0.0, 0.0, 1.0), FollowState(self._line.waypoint)
 
 
+class PedalSeat(DriverSeat):
+    """The whole stack, down to the pedals."""
+
+    sees: ClassVar[tuple[Feature, ...]] = (*DriverSeat.sees[:-1], Feature("action", 3, -1.0, 1.0, ACTION.doc))
+    n_actions: ClassVar[int] = 3
+    pedals = Output(PedalCommand, safe=PedalCommand(brake=0.27))
+
+    def act(self, action: Sequence[float]) -> None:
+        """Steering, full right to full left; throttle, 0 to 1 above 0; brake, 0 to 0.3 above 0."""
+        super().act((0.0, action[0]))
+        self.pedals = PedalCommand(action[0] * MAX_STEER_RAD, max(action[1], 0.0), 0.3 * max(action[2], 0.0))
+
+    def rest(self) -> None:
+        """Stand."""
+        super().rest()
+        self.pedals = PedalCommand(brake=0.15)
+
+
 class FollowSeat(DriverSeat):
     """The follower: from the estimated pose to a command."""
 
@@ -320,9 +339,10 @@ class PlanSeat(Seat):
 
 SEATS: dict[str, type[Seat]] = {
     "driver": DriverSeat,
+    "pedals": PedalSeat,
     "localise": LocaliseSeat,
     "plan": PlanSeat,
     "follow": FollowSeat,
     "avoid": AvoidSeat,
 }
-"""By the component of a stack that they replace; `driver` is that of the stack `bare`."""
+"""By the component of a stack that they replace. `driver` is that of the stack `bare`, `pedals` of `pedals`."""

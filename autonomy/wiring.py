@@ -159,7 +159,8 @@ def _loop(start: str, needs: dict[str, list[str]], path: list[str]) -> list[str]
 def needed(wire: Wire) -> list[str]:
     """Name the components without whose outputs a module is not called."""
     ports = load_module(wire.module).inputs
-    return [name.partition("/")[0] for port, name in wire.objects().items() if not ports[port].optional]
+    wired = wire.objects().items()
+    return [name.partition("/")[0] for port, name in wired if port in ports and not ports[port].optional]
 
 
 def required(stack: Stack) -> set[str]:

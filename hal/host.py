@@ -28,6 +28,7 @@ from .signals import (
     GpsFix,
     LinkCounters,
     Odometry,
+    PedalCommand,
     SafetyState,
     SystemState,
 )
@@ -38,7 +39,10 @@ CONFIG_BYTES = 300
 
 
 def ahead_ns(store: Store, cycle: int, t_ns: int) -> int:
-    """Say how much the store's time is ahead of the devices', whose time at the edge of a cycle is t_ns."""
+    """Say how much the store's time is ahead of the devices', whose time at the edge of a cycle is t_ns.
+
+    Not to be remembered from before the first tick: a real-time store has its t0 only then.
+    """
     return store.t0_ns + cycle * store.tick_ns - t_ns
 
 
@@ -84,7 +88,7 @@ class CartHost:
     """The cart's drivers on a store."""
 
     def __init__(self, store: Store, bus: CanBus, envelope: Envelope | None = None) -> None:
-        self._store, self._t0_ns, self._tick_ns = store, store.t0_ns, store.tick_ns
+        self._store, self._tick_ns = store, store.tick_ns
         self.driver = CartDriver(bus, METRES_PER_TICK, envelope)
         self._travel = store.join("odometry").insert("travel", Odometry)
         self._safety = store.join("safety").insert("state", SafetyState)
@@ -96,13 +100,16 @@ class CartHost:
             "config", json_schema(CONFIG_BYTES), flags=Flag.PUBLIC_WRITE, history_s=0.1
         )
         self._configured = 0
-        self._drive: Object[DriveCommand] | None = None
-        self._obeyed: Sample[DriveCommand] | None = None
+        self._drive: Object[DriveCommand] | Object[PedalCommand] | None = None
+        self._obeyed: Sample[Any] | None = None
         self._pointer, self._stopped = "", False
 
     def obey(self, pointer: str, timeout_s: float = 0.0) -> None:
         """Take commands from an object in the store. While disabled only."""
-        self._drive = self._store.find(pointer, DriveCommand, timeout_s=timeout_s)
+        if self._store.find(pointer, timeout_s=timeout_s).stored.name == PedalCommand.__name__:
+            self._drive = self._store.find(pointer, PedalCommand)
+        else:
+            self._drive = self._store.find(pointer, DriveCommand)
         self._pointer, self._obeyed = pointer, None
         self._configured = self._config.write({"inputs": {"drive": pointer}})
 
@@ -112,7 +119,7 @@ class CartHost:
 
     def step(self, cycle: int, t_ns: int) -> None:
         """Read the bus, commit what was heard, send what is due."""
-        ahead = self._t0_ns + cycle * self._tick_ns - t_ns
+        ahead = ahead_ns(self._store, cycle, t_ns)
         heard = self.driver.poll()
         for odometry, t_data_ns in heard.odometry:
             self._travel.write(odometry, t_data_ns + ahead)
@@ -131,7 +138,7 @@ class CartHost:
         """Send the command that this cut shows."""
         sample = self._obeyed = self._drive.visible_since(cycle, self._obeyed) if self._drive is not None else None
         command, origin_ns = (sample.value, sample.t_data_ns) if sample is not None else (None, t_ns + ahead)
-        origin_cycle = (origin_ns - self._t0_ns) // self._tick_ns
+        origin_cycle = cycle + (origin_ns - ahead - t_ns) // self._tick_ns
         sent = self.driver.command(t_ns, command, origin_ns - ahead, origin_cycle)
         if sent is not None:
             self._command.write(sent, t_ns + ahead if sample is None else None, inputs=(sample,) if sample else ())
@@ -146,7 +153,7 @@ class CartHost:
             self.obey(pointer)
         except (WiringError, RtdbError) as error:
             self._configured = self._config.write({"inputs": {"drive": self._pointer}})
-            self._actuators.status(f"wiring refused: {error}", State.WARNING)
+            self._actuators.status(f"wiring refused in cycle {cycle}: {error}", State.WARNING)
             return
         self._actuators.status(f"wired anew in cycle {cycle}")
 

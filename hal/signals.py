@@ -214,6 +214,14 @@ class DriveCommand(Record, frozen=True):
 STOP = DriveCommand()
 
 
+class PedalCommand(Record, frozen=True):
+    """How to drive, nearer to the actuators: pedals instead of a speed. Passed while the motion is in the envelope."""
+
+    steer_rad: Annotated[float, f8("rad", "road-wheel angle wanted, left positive", low=-0.47, high=0.47)] = 0.0
+    throttle: Annotated[float, f8("1", "share of the drive force, backward negative", low=-1.0, high=1.0)] = 0.0
+    brake: Annotated[float, f8("1", "brake effort; above 0 the throttle counts for nothing", low=0.0, high=1.0)] = 0.0
+
+
 class Limit(IntEnum):
     """Why the limits did not pass a command as it was."""
 

@@ -41,17 +41,18 @@ Observation = np.ndarray[Any, Any] | dict[str, np.ndarray[Any, Any]]
 Action = np.ndarray[Any, Any]
 READY_S = 5.0  # an episode begins by then, ready or not
 OFF_COURSE_M = {"plan": 12.0, "avoid": 12.0}  # where going around something is the task
-DRIVER = "driver"
+WHOLE = {"driver": "bare.json", "pedals": "pedals.json"}  # agents that replace the whole stack
 
 
 class CartEnv(gymnasium.Env[Observation, Action]):
     """One scenario as an environment.
 
-    scenario: id or path; agent: component to be replaced (follow, localise, plan, avoid; driver for the whole stack);
-    level: direct or wire, with the same observations; observation: flat (one array in [-1, 1]) or dict (by name, in
-    units); tier: sensors (what a module can know) or truth; randomise: none, mild, wide; seeds: how many different
-    episodes `reset` without a seed draws from, each warm after its first time, 0 for a new one each time; use: swaps
-    of other modules, COMPONENT=FILE.py:Class; record: folder for recordings, which begin cold.
+    scenario: id or path; agent: component to be replaced: follow, localise, plan, avoid, or for the whole stack driver
+    (speed and steering) or pedals (throttle, brake, steering); level: direct or wire, with the same observations;
+    observation: flat (one array in [-1, 1]) or dict (by name, in units); tier: sensors (what a module can know) or
+    truth; randomise: none, mild, wide; seeds: how many different episodes `reset` without a seed draws from, each warm
+    after its first time, 0 for a new one each time; use: swaps of other modules, COMPONENT=FILE.py:Class; record:
+    folder for recordings, which begin cold.
     """
 
     metadata = {"render_modes": ["rgb_array", "rerun"], "render_fps": 25}  # noqa: RUF012 - as gymnasium has it
@@ -81,7 +82,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
                 raise ValueError(f"{name}={value!r}: there are {', '.join(map(str, known))}")
         self.render_mode, self.level, self.randomise, self.seeds = render_mode, level, randomise, seeds
         self.scenario, self.agent, self.tier = load_scenario(scenario), agent, tier
-        path = STACKS / "bare.json" if agent == DRIVER else self.scenario.stack_path()
+        path = STACKS / WHOLE[agent] if agent in WHOLE else self.scenario.stack_path()
         self.stack = stack_with(path, list(use))
         wire = next((w for w in self.stack.wires if w.component == agent), None)
         if wire is None:

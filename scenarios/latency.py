@@ -7,7 +7,7 @@ component that is due takes the oldest data time of its inputs, and its outputs 
 import math
 from dataclasses import dataclass
 
-from autonomy.loading import load_module
+from autonomy.loading import check_inputs, load_module
 from autonomy.wiring import Stack
 
 BURST_TICKS = 2  # the HAL sends commands every 20 ms
@@ -39,6 +39,8 @@ def _follow(stack: Stack, sensor: str, sensor_ticks: int, period: int) -> list[i
     shown: dict[str, int] = {}  # object -> measuring tick of the data that it shows
     pending: dict[int, dict[str, int]] = {}  # by the tick from which it shows
     modules = {wire.component: load_module(wire.module) for wire in stack.wires}
+    for wire in stack.wires:
+        check_inputs(wire.component, modules[wire.component], wire.inputs)
     wired = {wire.component: wire.objects() for wire in stack.wires}
     ages = []
     for tick in range(20 * period):

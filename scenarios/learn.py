@@ -69,8 +69,8 @@ def network_of(model: "PPO", env: Any = None) -> Network:
 
     activations = {nn.Tanh: "tanh", nn.ReLU: "relu"}
     policy: Any = model.policy
-    if type(policy).__name__ != "ActorCriticPolicy" or policy.use_sde:
-        raise LearnError(f"only PPO with an MlpPolicy, without sde, can be exported; got {type(policy).__name__}")
+    if type(policy).__name__ != "ActorCriticPolicy" or policy.squash_output:
+        raise LearnError(f"only PPO with an MlpPolicy, not squashed, can be exported; got {type(policy).__name__}")
     layers: list[tuple[Any, Any, str]] = []
     for part in [*policy.mlp_extractor.policy_net, policy.action_net]:
         if isinstance(part, nn.Linear):

@@ -503,7 +503,12 @@ def seats(old: str) -> str:
         return " ".join((doc or "").split())
 
     rows = [
-        (code(name), ", ".join(f.name for f in seat.sees), str(seat.n_actions), f"{said(seat.__doc__)} {said(seat.act.__doc__)}")
+        (
+            code(name),
+            ", ".join(f.name for f in seat.sees),
+            str(seat.n_actions),
+            f"{said(seat.__doc__)} {said(seat.act.__doc__)}",
+        )
         for name, seat in SEATS.items()
     ]
     return table("agent | sees | numbers of an action | what it does", rows)
@@ -514,7 +519,7 @@ def features(old: str) -> str:
     from autonomy.seats import SEATS
 
     del old
-    known = {f.name: f for seat in SEATS.values() for f in reversed(seat.sees)} | {TRUTH.name: TRUTH}
+    known = {f.name: f for seat in SEATS.values() for f in seat.sees} | {TRUTH.name: TRUTH}
     rows = [(code(f.name), str(f.size), f"{f.low:.4g}", f"{f.high:.4g}", f.doc) for f in known.values()]
     return table("feature | numbers | low | high | what they are", rows)
 
@@ -534,7 +539,11 @@ def randomisation(old: str) -> str:
 
     del old
     rows = [
-        (code(f.name), *(f"{low:g} to {high:g}" for low, high in (getattr(r, f.name) for r in RANGES.values())), f.spec.doc)
+        (
+            code(f.name),
+            *(f"{low:g} to {high:g}" for low, high in (getattr(r, f.name) for r in RANGES.values())),
+            f.spec.doc,
+        )
         for f in schema_of(Randomised).fields
     ]
     return table(f"what | {' | '.join(RANGES)} | meaning", rows)

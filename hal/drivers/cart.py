@@ -4,6 +4,8 @@ Every 20 ms it sends the three actuator commands in one burst, every 50 ms SYSTE
 once the safety node is ready and a fresh command is there; it never clears a fault by itself.
 """
 
+import math
+
 import msgspec
 
 from hal.bus import CanBus
@@ -27,6 +29,7 @@ from hal.signals import (
     Limit,
     LinkCounters,
     Odometry,
+    PedalCommand,
     SafetyState,
     SystemState,
     state_of,
@@ -130,11 +133,31 @@ class CartDriver:
         """Frames received, refused and missed so far."""
         return LinkCounters(self._received, self.port.damaged, self._lost)
 
+    def _meant(self, command: DriveCommand | PedalCommand | None) -> DriveCommand | None:
+        """Give the command that the limits look at: of pedals, to go on at the present speed with their steering."""
+        if not isinstance(command, PedalCommand):
+            return command
+        finite = math.isfinite(command.throttle + command.brake)
+        return DriveCommand(self._speed_mps if finite else math.nan, command.steer_rad)
+
+    def _throttle(self, pedals: PedalCommand | None, speed_mps: float, enable: bool) -> ThrottleCmd:
+        """Make the throttle's command: never against the brake."""
+        if pedals is not None:
+            throttle = 0.0 if self._braking else pedals.throttle
+            direction = FORWARD if throttle >= 0 else REVERSE
+            return ThrottleCmd.of_percent(percent_ratio=throttle, enable=enable, direction=direction)
+        direction = FORWARD if speed_mps >= 0 else REVERSE
+        speed_mps = 0.0 if self._braking else speed_mps
+        return ThrottleCmd.of_speed(
+            speed_mps=speed_mps, accel_limit_mps2=ACCEL_LIMIT_MPS2, enable=enable, direction=direction
+        )
+
     def command(
-        self, t_ns: int, command: DriveCommand | None, origin_ns: int, origin_cycle: int
+        self, t_ns: int, command: DriveCommand | PedalCommand | None, origin_ns: int, origin_cycle: int
     ) -> ActuatorCommand | None:
         """Send what is due at t_ns; returns what the burst asked for, None between bursts.
 
+        Pedals are passed while the cart's speed is within the limits for their steering angle, else the limits decide.
         origin_ns, origin_cycle: when the oldest sensor data behind the command was true.
         """
         if t_ns % SYSTEM_NS == 0:
@@ -143,7 +166,8 @@ class CartDriver:
             )
         if t_ns % BURST_NS != 0:
             return None
-        drive, why = limit(command, t_ns - origin_ns, self.envelope)
+        pedals = command if isinstance(command, PedalCommand) else None
+        drive, why = limit(self._meant(command), t_ns - origin_ns, self.envelope)
         self._origin_cycle = origin_cycle
         self._idle = min(self._idle + 1, IDLE_BURSTS) if self.state is READY else 0
         self._asking = self._asking + 1 if self._enable and self.state is READY else 0
@@ -156,18 +180,13 @@ class CartDriver:
         if why in NO_ANGLE:
             drive = DriveCommand(0.0, self._steer_rad)  # a stop without an angle of its own keeps the last good one
         self._steer_rad = drive.steer_rad
-        effort = brake_effort(drive, self._speed_mps, self._braking)
+        passed = pedals is not None and why is Limit.NONE
+        most = self.envelope.max_decel_mps2 / FULL_BRAKE_MPS2
+        effort = min(pedals.brake, most) if pedals and passed else brake_effort(drive, self._speed_mps, self._braking)
         self._braking = effort > 0.0
-        drive_mps = 0.0 if self._braking else drive.speed_mps  # never against each other
-        direction = FORWARD if drive.speed_mps >= 0 else REVERSE
         self.port.send(SteerCmd.of(angle_rad=drive.steer_rad, enable=enable), t_ns)
         self.port.send(BrakeCmd.of(effort_ratio=effort, enable=enable), t_ns)
-        self.port.send(
-            ThrottleCmd.of_speed(
-                speed_mps=drive_mps, accel_limit_mps2=ACCEL_LIMIT_MPS2, enable=enable, direction=direction
-            ),
-            t_ns,
-        )
+        self.port.send(self._throttle(pedals if passed else None, drive.speed_mps, enable), t_ns)
         return ActuatorCommand(drive.speed_mps, drive.steer_rad, effort, self._enable, why, origin_cycle)
 
 

@@ -431,6 +431,24 @@ def test_watch_ends_no_other_step_than_the_one_that_hangs(monkeypatch: pytest.Mo
     assert hung > 5
 
 
+def test_long_reason_keeps_the_place_in_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "long.py"
+    file.write_text(MISBEHAVING.replace("lost my way", "ä" * 300))
+    with Rig(file, "Raises", apart=False) as rig:
+        rig.ticks(5)
+        good_line(rig.status.reason)
+        assert re.fullmatch(r"cycle 4: ValueError: ä+ \(long\.py:\d+\)", rig.status.reason)
+
+
+def test_reset_may_take_longer_than_a_step(bad: Path, tmp_path: Path) -> None:
+    file = tmp_path / "thorough.py"
+    busy = "end_s = time.thread_time() + 1.3\n        while time.thread_time() < end_s:\n            pass"
+    file.write_text(MISBEHAVING.replace("self.hoard = []\n", f"{busy}\n        self.hoard = []\n"))
+    with Rig(file, "Good", apart=False, budget_ms=5.0) as rig:
+        rig.ticks(3)
+        assert rig.status.state is ModuleState.RUNNING
+
+
 # -- latency, budget, deadline ----------------------------------------------------------------------------------------
 
 

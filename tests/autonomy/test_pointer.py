@@ -255,6 +255,19 @@ def test_json_that_does_not_fit_counts_as_absent(document: dict[str, Any], why: 
     assert rig.module.seen == [1.0, 3.0]
 
 
+def test_text_that_is_no_json_counts_as_absent() -> None:
+    """Another program says that it writes JSON, and does not."""
+    rig = Rig(Reads, {"speed_mps": "source/json#/speed_mps"})
+    rig.tick(json={"speed_mps": 1.0})
+    rig.store.core.write(rig.json.handle, b"{oops".ljust(rig.json.size, b"\0"), rig.store.now_ns, ())
+    for _ in range(2):
+        rig.tick()
+    assert rig.status.state is ModuleState.STALE
+    assert rig.status.reason.startswith("input speed_mps (source/json#/speed_mps) cannot be read: not JSON")
+    rig.tick(json={"speed_mps": 2.0})
+    assert rig.module.seen == [1.0, 2.0]
+
+
 def test_unit_of_a_json_key_that_is_another_one_is_said_at_each_read() -> None:
     rig = Rig(Reads, {"speed_mps": "source/json#/speed_kmh"})
     rig.tick(json={"speed_kmh": 7.2})

@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 from autonomy.cli import register
 from autonomy.module import ModuleError
 from autonomy.starter import KINDS, STARTERS, camel_case, write
-from scenarios.scenario import STACKS
 
 ROOT = Path(__file__).resolve().parents[2]
 ENV = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "200"}
@@ -114,8 +113,6 @@ def test_type_checker_passes_each_starter_and_catches_a_wrong_record(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_starter_drives_with_the_command_that_was_printed(folder: Path, kind: str, tmp_path: Path) -> None:
-    if KINDS[kind].scenario.startswith("obstacles/") and not (STACKS / "obstacles.json").is_file():
-        pytest.skip("the stack with plan and avoid is not there: autonomy/stacks/obstacles.json")
     name = f"my_{kind}"
     scenario = KINDS[kind].scenario or f"{name}.scenario.yaml"
     use = f"{KINDS[kind].component}={name}.py:{camel_case(name)}"
