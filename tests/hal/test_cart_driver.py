@@ -28,7 +28,7 @@ from hal.codecs.cartcan import (
 )
 from hal.drivers.cart import HOLD_EFFORT, STANDSTILL_MPS, CartDriver, actuator_state, brake_effort
 from hal.limits import Envelope, limit
-from hal.signals import ActuatorCommand, DriveCommand, Limit, SystemState
+from hal.signals import ActuatorCommand, DriveCommand, Limit, PedalCommand, SystemState
 
 MS = 1_000_000
 TICK_NS = 10 * MS
@@ -50,7 +50,7 @@ class Bench:
         self.odometer = self.bus.port("ODOM", [])
         self.t_ns = T0_NS
         self.state = SystemState.READY
-        self.command: DriveCommand | None = FORWARD
+        self.command: DriveCommand | PedalCommand | None = FORWARD
         self.age_ns: Callable[[], int] = lambda: 50 * MS
         self.speed_mps = self._metres = 0.0
         self.said: list[ActuatorCommand] = []
@@ -416,3 +416,52 @@ def test_a_cart_that_is_to_stand_is_always_braked(speed_mps: float) -> None:
 
 def test_braking_uses_all_it_may_when_much_too_fast() -> None:
     assert brake_effort(DriveCommand(speed_mps=1.0, decel_mps2=1.2), 3.0) * FULL_BRAKE_MPS2 == pytest.approx(1.2)
+
+
+# -- pedals -----------------------------------------------------------------------------------------------------------
+
+
+def last_burst(bench: Bench) -> tuple[SteerCmd, BrakeCmd, ThrottleCmd]:
+    return bench.sent(SteerCmd)[-1][1], bench.sent(BrakeCmd)[-1][1], bench.sent(ThrottleCmd)[-1][1]
+
+
+def test_pedals_go_out_as_they_are_while_the_motion_is_within_the_envelope() -> None:
+    bench = Bench().enabled(speed_mps=2.0)
+    bench.command = PedalCommand(steer_rad=0.1, throttle=0.5)
+    bench.run(200)
+    steer, brake, throttle = last_burst(bench)
+    assert steer.angle_rad == pytest.approx(0.1, abs=1e-3)
+    assert brake.effort_ratio == 0.0
+    assert (throttle.mode, throttle.percent_ratio) == (ThrottleMode.PERCENT, pytest.approx(0.5, abs=0.01))
+
+
+def test_brake_pedal_takes_the_throttle_away_and_never_locks_the_axle() -> None:
+    bench = Bench().enabled(speed_mps=2.0)
+    bench.command = PedalCommand(throttle=1.0, brake=1.0)
+    bench.run(200)
+    _, brake, throttle = last_burst(bench)
+    assert brake.effort_ratio == pytest.approx(0.3, abs=0.01)  # 1.5 m/s2
+    assert throttle.percent_ratio == 0.0
+
+
+@pytest.mark.parametrize(
+    ("pedals", "speed_mps", "age_ms", "why"),
+    [
+        (PedalCommand(throttle=1.0), 2.0, 251, Limit.STALE),
+        (PedalCommand(throttle=math.nan), 2.0, 50, Limit.NOT_FINITE),
+        (PedalCommand(throttle=1.0, steer_rad=0.6), 2.0, 50, Limit.STEER),
+        (PedalCommand(throttle=1.0), 5.8, 50, Limit.SPEED),
+        (PedalCommand(throttle=1.0, steer_rad=0.45), 4.0, 50, Limit.LATERAL),
+    ],
+)
+def test_limits_decide_where_pedals_would_leave_the_envelope(
+    pedals: PedalCommand, speed_mps: float, age_ms: int, why: Limit
+) -> None:
+    bench = Bench().enabled(speed_mps=speed_mps)
+    bench.command, bench.age_ns = pedals, lambda: age_ms * MS
+    bench.run(300)
+    _, brake, throttle = last_burst(bench)
+    assert bench.said[-1].limit is why
+    assert brake.effort_ratio is not None
+    assert brake.effort_ratio > 0.0
+    assert throttle.mode == ThrottleMode.SPEED

@@ -92,7 +92,7 @@ def test_stable_baselines_checker_passes_without_a_warning(name: str) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("agent", ["driver", "localise", "follow"])
+@pytest.mark.parametrize("agent", ["driver", "pedals", "localise", "follow"])
 @pytest.mark.parametrize("observation", ["flat", "dict"])
 @pytest.mark.parametrize("tier", ["sensors", "truth"])
 def test_checker_passes_for_each_agent_form_and_tier(agent: str, observation: str, tier: str, straight: str) -> None:
