@@ -45,7 +45,7 @@ class DriveError(Exception):
 class CartSetup:
     """Which cart, where: a scenario with its seed, how much of the wire, which form of the plant, what is randomised.
 
-    make_world: see scenarios.run.Setup.
+    truth, make_world: see scenarios.run.Setup.
     """
 
     scenario: Scenario
@@ -53,6 +53,7 @@ class CartSetup:
     level: Level = "wire"
     plant: PlantKind = "compiled"
     randomise: Kind = "none"
+    truth: bool = True
     make_world: Callable[[Scene], World] | None = None
 
 
@@ -113,12 +114,15 @@ class SimulatedCart:
     def before_edge(self, next_cycle: int) -> None:
         """Move the world on by a tick, and write what shows at the coming edge: the truth of that very edge."""
         self.sim.advance(TICK_NS)
-        if next_cycle % 2 == 0:
+        if next_cycle % 2:
+            return
+        if self.setup.truth:
             self._truth.write(self.sim.truth(), self.sim.t_ns)
         if next_cycle % 10 == 0:
-            if self._clearance is not None:
-                self._clearance.write(self.sim.take_clearance(), self.sim.t_ns)
-            if self._actors is not None:
+            clearance = self.sim.take_clearance()
+            if self._clearance is not None and self.setup.truth:
+                self._clearance.write(clearance, self.sim.t_ns)
+            if self._actors is not None and self.setup.truth:
                 self._actors.write(self.sim.actors(), self.sim.t_ns)
 
     def tell_faults(self, t_ns: int) -> None:

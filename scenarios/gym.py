@@ -186,7 +186,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
             self._warm.popitem(last=False)[1].drive.close()
         if self._recording and self._drive is not None:
             self._drive.close()
-        drive = Drive(self.setup_of(seed, self.stack))
+        drive = Drive(self.setup_of(seed, self.stack, self._recording))
         if self._recording:
             self._start_recording(drive)
         try:
@@ -206,14 +206,15 @@ class CartEnv(gymnasium.Env[Observation, Action]):
             self._warm[seed] = Image(drive, self.referee)
         return drive
 
-    def setup_of(self, seed: int, stack: Stack) -> Setup:
-        """Give the drive of an episode."""
+    def setup_of(self, seed: int, stack: Stack, truth: bool = True) -> Setup:
+        """Give the drive of an episode. truth: it will be recorded."""
         return Setup(
             scenario=self.scenario,
             seed=seed,
             level=self.level,
             stack=stack,
             randomise=self.randomise,
+            truth=truth,
             agent=self.agent,
             make_world=self._furnished,
         )
@@ -319,7 +320,7 @@ def run_module(
     cart = env.unwrapped
     assert isinstance(cart, CartEnv)
     cart.reset(seed=seed)  # the world is that of this seed, and nobody else's episode is under way
-    setup = replace(cart.setup_of(seed, cart.stack.use(cart.agent, module)), placement=placement)
+    setup = replace(cart.setup_of(seed, cart.stack.use(cart.agent, module), True), placement=placement)
     with Drive(setup) as drive, Recorder(recording, [drive.cart, drive.world], metadata(setup)) as recorder:
         while not go_on(drive, recorder):
             assert drive.agent is not None

@@ -69,6 +69,7 @@ class Referee:
         self._arrival = sum(station.s_m < near_m for station in stations)
         s = sim.plant.state
         self._line.move(s.x_m, s.y_m)
+        self._along_m = self._line.along(s.x_m, s.y_m)
         self.aside_m, self.heading_rad, _ = self._line.aside(s.x_m, s.y_m, s.yaw_rad)
 
     def judge(self, dt_s: float, steering: float, pose: Pose | None) -> tuple[Reward, End]:
@@ -77,13 +78,14 @@ class Referee:
         steering: the steering action; pose: the estimate to be judged, None where that is not the task.
         """
         s = self._sim.plant.state
-        progress = self._line.move(s.x_m, s.y_m)
+        self._line.move(s.x_m, s.y_m)
+        before_m, self._along_m = self._along_m, self._line.along(s.x_m, s.y_m)
         self.aside_m, self.heading_rad, _ = self._line.aside(s.x_m, s.y_m, s.yaw_rad)
         end = self._end()
         jerk = min(abs(s.ax_mps2 - self._accel_mps2) / dt_s, 10.0)
         arrived = self._line.at >= self._arrival and not self.arrived
         terms = (
-            progress,
+            self._along_m - before_m,
             -0.5 * dt_s * min(abs(self.aside_m), 3.0),
             -0.1 * abs(steering - self._steering),
             -0.02 * dt_s * jerk,

@@ -13,7 +13,7 @@ from autonomy.module import Input, ModuleError
 from autonomy.pointer import link
 from autonomy.wiring import ACTUATORS, Stack, Wire, check_stack, wire_of
 from hal.host import drive_pointer
-from hal.signals import DriveCommand, ModuleState, ModuleStatus
+from hal.signals import DriveCommand, ModuleState, ModuleStatus, PedalCommand
 from rtdb import Object, RtdbError, Store
 from rtdb.db.values import did_you_mean
 
@@ -83,7 +83,7 @@ def check_change(store: Store, stack: Stack, change: Change) -> Stack:
     """Give the wiring with a change, or raise what its host would say of it, in one line."""
     after = changed(stack, change)
     at_hal = change.component == ACTUATORS
-    port: Any = Input(DriveCommand) if at_hal else _module(stack, change.component).inputs[change.name]
+    port: Any = _hal_port(store, change) if at_hal else _module(stack, change.component).inputs[change.name]
     try:
         found = link(store, change.pointer, port)
     except (RtdbError, ModuleError) as error:
@@ -92,6 +92,12 @@ def check_change(store: Store, stack: Stack, change: Change) -> Stack:
         raise ModuleError(f"{change.component}.{change.name} = {change.pointer}: it holds JSON, not a DriveCommand")
     check_stack(after)
     return after
+
+
+def _hal_port(store: Store, change: Change) -> Any:
+    """Give what the actuators take: a command, or that of pedals."""
+    pedals = any(obj.stored.name == PedalCommand.__name__ for obj in store.objects(change.pointer))
+    return Input(PedalCommand if pedals else DriveCommand)
 
 
 def _module(stack: Stack, component: str) -> Any:

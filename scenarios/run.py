@@ -55,7 +55,8 @@ class Setup:
     plant: python is the readable form of the cart's dynamics; db: name of a shared store, None for a private one;
     placement: modules in this process, or each in its own; by_hand: the keyboard drives; shuffle: seed that permutes
     order, placement and delays, none of which may change the trace; faults: folder for the steps that broke a module;
-    randomise: what else the seed changes, see scenarios/randomise.py;
+    randomise: what else the seed changes, see scenarios/randomise.py; truth: the truth is written, False where nobody
+    records it;
     agent: component that the caller of `tick` asks and answers (`Drive.agent`), as a gymnasium environment does;
     make_world: gives the world of a scene, which stays its caller's, instead of one that ends with the drive.
     """
@@ -71,6 +72,7 @@ class Setup:
     shuffle: int | None = None
     faults: Path | None = None
     randomise: Kind = "none"
+    truth: bool = True
     agent: str | None = None
     make_world: Callable[[Scene], World] | None = None
 
@@ -112,6 +114,7 @@ class Drive:
                 level=setup.level,
                 plant=setup.plant,
                 randomise=setup.randomise,
+                truth=setup.truth,
                 make_world=setup.make_world,
             ),
             self.cart,
@@ -124,6 +127,7 @@ class Drive:
         self.simulated.obey(self.stack.command)
         self._list_work()
         self._ended_s = 0.0
+        self._last_cycle = int(setup.scenario.duration_s * 1e9) // TICK_NS  # from here on the time is looked at
         objects = {obj.name: obj.schema.name for obj in self.cart.objects()}
         ends: dict[str, type[Record]] = {cls.__name__: cls for cls in (FollowState, GuardState)}
         self._ends = [self.cart.find(n, ends[record]) for n, record in objects.items() if record in ends]
@@ -185,7 +189,8 @@ class Drive:
         assert self.simulated is not None
         self.simulated.before_edge(cart.cycle + 1)
         cycle = cart.tick()
-        world.tick()
+        if self.setup.truth:
+            world.tick()
         t_ns = cart.now_ns
         if recorder is not None:
             recorder.record()
@@ -194,7 +199,8 @@ class Drive:
             self._order.shuffle(work)  # all of them read this cut and write for later ones: the order cannot matter
         for step in work:
             step(cycle, t_ns)
-        self.simulated.tell_faults(t_ns)
+        if self.setup.truth:
+            self.simulated.tell_faults(t_ns)
         if self._children:
             self._wait_for_processes(cycle)
         return self._over(cycle)
@@ -213,9 +219,11 @@ class Drive:
 
     def _over(self, cycle: int) -> bool:
         """Say whether the drive ends: by time, by hand, or because the cart stands and will not go on."""
-        now_s = self.time_s
         if self._hand is not None and self._hand.hand.quit:
             return True
+        if cycle % 10 and not self._ended_s and cycle < self._last_cycle:
+            return False
+        now_s = self.time_s
         if cycle % 10 == 0:
             standing = abs(self.sim.plant.state.vx_mps) < 0.01
             self._ended_s = (self._ended_s or now_s) if standing and self._ended(cycle) else 0.0

@@ -149,7 +149,7 @@ class SimCart:
         self._laser = SynLaser(self.world, setup.laser, rng("laser")) if self.world and setup.laser else None
         self.add_actors()
         self._demand = Demand(brake=PARK_EFFORT)
-        self._nearest, self._far = Clearance(), False
+        self._nearest, self._taken, self._far = Clearance(), Clearance(), False
         self.t_ns = setup.t_ns
         self.estop_button = False
 
@@ -267,8 +267,8 @@ class SimCart:
 
     @property
     def nearest_m(self) -> float:
-        """Distance to the nearest thing at the last look, at most 5."""
-        return self._nearest.distance_m
+        """Smallest distance to anything at the last looks, at most 5 m."""
+        return min(self._nearest.distance_m, self._taken.distance_m)
 
     def actors(self) -> ActorsTruth:
         """Where the actors are."""
@@ -278,8 +278,8 @@ class SimCart:
 
     def take_clearance(self) -> Clearance:
         """Give the smallest clearance since the last call."""
-        nearest, self._nearest = self._nearest, Clearance(collided=self._nearest.collided)
-        return nearest
+        self._taken, self._nearest = self._nearest, Clearance(collided=self._nearest.collided)
+        return self._taken
 
     def close(self) -> None:
         """Give the world back."""
