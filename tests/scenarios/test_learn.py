@@ -259,6 +259,21 @@ def test_reference_follower_is_marked_by_the_same_referee(straight: str) -> None
         assert one.aside_rms_m < 0.5
 
 
+def test_progress_is_what_was_driven_in_each_step_and_arriving_is_coming_near_the_end(straight: str) -> None:
+    env = CartEnv(straight)
+    env.reset(seed=5)
+    told, over = [], False
+    while not over:
+        _, _, _, over, info = env.step(np.array([1.0, 0.0]))
+        told.append(info["reward_terms"] | {"left_m": 15.0 - env.referee._along_m})
+    env.close()
+    progress = np.array([terms["progress"] for terms in told])
+    assert progress[50:100].min() > 0.02  # not in steps of the line's stations, half a metre apart
+    assert progress.max() < 1.1 * 3.0 * 0.04
+    (arrival,) = [terms for terms in told if terms["arrived"]]
+    assert arrival["left_m"] == pytest.approx(1.0, abs=0.5)  # the way-point's radius
+
+
 def test_who_stands_does_not_arrive(straight: str) -> None:
     (episode,) = evaluate(lambda _: np.array([-1.0, 0.0]), SCENARIO, [5], scenario=straight)
     assert (episode.arrived, episode.end, episode.time_s) == (False, "", pytest.approx(12.0))
