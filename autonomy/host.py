@@ -43,6 +43,7 @@ CONFIG_BYTES, SHOW_BYTES = 2000, 2000
 REASON_BYTES = 160  # as ModuleStatus has it
 OWN_FILES = Path(__file__).parent, ("host.py", "module.py")  # their lines tell a student nothing
 FOREVER_NS = 1 << 62
+JSON_EDGES = 3  # so many of its writer's edges old may a JSON input be that has no max_age_s
 watch = Watch()
 
 
@@ -145,8 +146,16 @@ class Host:
                 except (RtdbError, ModuleError) as error:
                     if not (port.optional and isinstance(error, KeyError)):  # nobody need provide what is optional
                         raise ModuleError(f"{wire.component}.{name} = {pointer}: {error}") from error
-            out.append((name, port, found, int(port.max_age_s * 1e9) if port.max_age_s is not None else FOREVER_NS))
+            out.append((name, port, found, self._max_age_ns(port, found)))
         return out
+
+    def _max_age_ns(self, port: InputPort[Any], found: Link | None) -> int:
+        """Give the age from which on an input counts as absent."""
+        if port.max_age_s is not None:
+            return int(port.max_age_s * 1e9)
+        if found is not None and found.json and not port.static:  # who writes JSON says how often, and nothing else
+            return JSON_EDGES * found.obj.every * self._store.tick_ns
+        return FOREVER_NS
 
     # -- one cycle --------------------------------------------------------------------------------------------------
 
@@ -239,41 +248,43 @@ class Host:
 
     def _read(self, cycle: int, now_ns: int) -> str:
         """Put the inputs of this cut into the module; returns what is absent, empty if nothing is."""
-        module, values, last = self.module, self.module.__dict__, self._last
-        samples = module.samples
-        before = dict(samples)
-        samples.clear()
+        module = self.module
+        before = dict(module.samples)
+        module.samples.clear()
         for name, port, found, max_age_ns in self._inputs:
-            sample: Sample[Any] | None = None
-            why = "is not there yet"
-            if found is not None:
+            absent = self._take(name, found, max_age_ns, cycle, now_ns, before.get(name))
+            if absent and not port.optional:
+                return f"input {name} ({inputs_of(type(module), self.wire.inputs)[name]}) {absent}"
+            if absent:
+                module.__dict__[name] = None
+        return ""
+
+    def _take(
+        self, name: str, found: Link | None, max_age_ns: int, cycle: int, now_ns: int, before: Sample[Any] | None
+    ) -> str:
+        """Put one input into the module; returns why it is absent, empty if it is there."""
+        if found is None:
+            return "is not there yet"
+        try:
+            sample = found.obj.visible_since(cycle, before)
+        except RtdbError as error:  # aged out, or no JSON
+            return f"cannot be read: {error}"
+        if sample is None:
+            return "is not there yet"
+        age_ns = now_ns - (sample.t_commit_ns if found.json else sample.t_data_ns)
+        if age_ns > max_age_ns:
+            return f"is {age_ns * 1e-9:.2f} s old, at most {max_age_ns * 1e-9:g} s"
+        value = sample.value
+        if found.value is not None:
+            known = self._last.get(name)
+            if known is None or known[0] != sample.write:
                 try:
-                    sample = found.obj.visible_since(cycle, before.get(name))
-                except RtdbError as error:  # aged out, or no JSON: absent as well
-                    why = f"cannot be read: {error}"
-            if sample is None:
-                pass
-            elif found is not None:
-                age_ns = now_ns - (sample.t_commit_ns if found.json else sample.t_data_ns)
-                if age_ns > max_age_ns:
-                    why = f"is {age_ns * 1e-9:.2f} s old, at most {port.max_age_s} s"
-                elif found.value is None:
-                    samples[name] = sample
-                    values[name] = sample.value
-                    continue
-                else:
-                    known = last.get(name)
-                    try:
-                        if known is None or known[0] != sample.write:
-                            last[name] = known = (sample.write, found.value(sample))
-                        samples[name] = sample
-                        values[name] = known[1]
-                        continue
-                    except Unusable as error:
-                        why = f"cannot be used: {error}"
-            if not port.optional:
-                return f"input {name} ({inputs_of(type(module), self.wire.inputs)[name]}) {why}"
-            values[name] = None
+                    known = self._last[name] = (sample.write, found.value(sample))
+                except Unusable as error:
+                    return f"cannot be used: {error}"
+            value = known[1]
+        self.module.samples[name] = sample
+        self.module.__dict__[name] = value
         return ""
 
     def _payloads(self) -> list[bytes]:

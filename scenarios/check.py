@@ -215,6 +215,7 @@ def _drive_and_judge(task: Task) -> Result:
             seed=task.seed,
             level=task.level,
             stack=stack_with(task.scenario.stack_path(), task.uses),
+            faults=task.folder,
         )
         drive(setup, recording)
         return judge(Recording(recording), task.scenario.parsed_criteria)

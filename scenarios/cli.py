@@ -68,6 +68,7 @@ def drive(
     by_hand: Annotated[
         bool, typer.Option("--by-hand", help="Drive with the arrow keys, in real time; q ends the drive.")
     ] = False,
+    placement: Annotated[str, typer.Option(help="inline, or process: each module in one of its own.")] = "inline",
     shuffle: Annotated[
         int | None, typer.Option(help="Permute order, processes and delays by this seed; the trace stays the same.")
     ] = None,
@@ -89,6 +90,8 @@ def drive(
         raise typer.BadParameter(f"{plant!r} is not one of compiled, python", param_hint="--plant")
     if randomise not in KINDS:
         raise typer.BadParameter(f"{randomise!r} is not one of {', '.join(KINDS)}", param_hint="--randomise")
+    if placement not in ("inline", "process"):
+        raise typer.BadParameter(f"{placement!r} is not one of inline, process", param_hint="--placement")
     if by_hand and not sys.stdin.isatty():
         raise typer.BadParameter("the keyboard is needed: standard input is not a terminal", param_hint="--by-hand")
     plan = load_scenario(scenario)
@@ -97,7 +100,7 @@ def drive(
     folder.mkdir(parents=True, exist_ok=True)
     setup = Setup(
         scenario=plan, seed=seed, stack=stack, db=db, by_hand=by_hand, shuffle=shuffle, faults=folder,
-        level=level, plant=plant, randomise=randomise,  # type: ignore[arg-type]
+        level=level, plant=plant, randomise=randomise, placement=placement,  # type: ignore[arg-type]
     )  # fmt: skip
     console = Console()
     if by_hand:
