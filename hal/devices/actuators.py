@@ -23,7 +23,7 @@ from hal.codecs.cartcan import (
 )
 from hal.signals import SystemState, state_of
 
-from .watch import GOOD_BEFORE_ENABLE, NEVER_NS, CommandWatch
+from .watch import GOOD_BEFORE_ENABLE, CommandWatch
 
 COMMAND_TIMEOUT_NS = 100_000_000
 SAFETY_TIMEOUT_NS = 250_000_000
@@ -47,7 +47,7 @@ class Node:
         self.estop = False
         self.enabled = False
         self._armed = False  # enough idle frames came before the enable bit
-        self._trusted_until_ns = NEVER_NS  # later than that, the safety node is silent
+        self._trusted_until_ns = CommandWatch.NEVER_NS  # later than that, the safety node is silent
         self._asked: Message | None = None
 
     def _listen(self, t_ns: int) -> None:

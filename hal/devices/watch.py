@@ -8,12 +8,10 @@ LEAK_LIMIT = 5
 GOOD_BEFORE_ENABLE = 3
 
 
-NEVER_NS = -(1 << 63)
-
-
 class CommandWatch:
     """Watches one command id. A frame is good if its checksum holds and its counter follows the last one."""
 
+    NEVER_NS = -(1 << 63)  # before any time
     __slots__ = (
         *("_counter", "_in_a_row", "_leak", "asks", "bad_counter", "bad_crc", "fresh_until_ns"),
         *("idle_streak", "rejected", "timeout_ns", "tripped"),
@@ -21,7 +19,7 @@ class CommandWatch:
 
     def __init__(self, timeout_ns: int) -> None:
         self.timeout_ns = timeout_ns
-        self.fresh_until_ns = NEVER_NS  # later than that, the command is silent
+        self.fresh_until_ns = self.NEVER_NS  # later than that, the command is silent
         self.tripped = False  # too many bad frames to go on
         self.bad_crc = self.bad_counter = False  # what the latest bad frames had
         self.rejected = False  # a frame was refused since the last report
