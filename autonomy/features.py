@@ -113,12 +113,12 @@ class Line:
         return left_m, wrap(yaw_rad - along_rad), self.stations[self.at].speed_mps
 
     def along(self, x_m: float, y_m: float) -> float:
-        """Give how far along the line a place is, m; between two stations, too."""
+        """Give how far along the line a place is, m, between two stations, too; never beyond its end."""
         if not self.stations:
             return 0.0
         k = min(self.at, len(self.stations) - 2)
         a, b = self.stations[k], self.stations[k + 1]
-        return a.s_m + on_leg((a.x_m, a.y_m), (b.x_m, b.y_m), (x_m, y_m))[0]
+        return min(a.s_m + on_leg((a.x_m, a.y_m), (b.x_m, b.y_m), (x_m, y_m))[0], self.stations[-1].s_m)
 
     def ahead(self, x_m: float, y_m: float, yaw_rad: float) -> list[float]:
         """Give points of the line ahead in C: x, y of each; the last one again where the line ends."""

@@ -201,7 +201,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         except BaseException:
             drive.close()
             raise
-        self.referee = self._make_referee(drive)
+        self.referee = self.make_referee(drive)
         if not self._recording:
             self._warm[seed] = Image(drive, self.referee)
         return drive
@@ -234,7 +234,8 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         assert isinstance(seat, Seat)
         return self._drive, seat
 
-    def _make_referee(self, drive: Drive) -> Referee:
+    def make_referee(self, drive: Drive) -> Referee:
+        """Give the referee of a drive of this environment."""
         assert drive.simulated is not None
         site = drive.cart.find("mission/site", SiteRecord).visible(drive.cart.cycle)
         assert site is not None

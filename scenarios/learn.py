@@ -165,7 +165,7 @@ def _driven(cart: CartEnv, module: str, seed: int) -> Iterator[_Judged]:
     with Drive(cart.setup_of(seed, cart.stack.use(cart.agent, module))) as drive:
         assert drive.agent is not None
         over, end = go_on(drive), End.NONE
-        referee = cart._make_referee(drive)
+        referee = cart.make_referee(drive)
         while not (over or end is not End.NONE):
             drive.agent.finish()
             over = go_on(drive)

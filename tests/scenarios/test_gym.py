@@ -23,6 +23,7 @@ from scenarios.run import Setup, drive
 from scenarios.scenario import load_scenario
 
 NAMED = [name for name in IDS if name != "Fairway/Scenario-v0"]
+REASON = "the extra 'learn' is not installed: stable-baselines3, torch, jupytext"
 STRAIGHT = """\
 id: test/straight
 about: Straight on, and over.
@@ -82,9 +83,7 @@ def test_gymnasiums_checker_passes_without_a_warning(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMED)
 def test_stable_baselines_checker_passes_without_a_warning(name: str) -> None:
-    checker = pytest.importorskip(
-        "stable_baselines3.common.env_checker", reason="stable-baselines3 is not installed (extra learn)"
-    )
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason=REASON)
     env = gymnasium.make(name)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

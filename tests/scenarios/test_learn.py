@@ -270,6 +270,7 @@ def test_progress_is_what_was_driven_in_each_step_and_arriving_is_coming_near_th
     progress = np.array([terms["progress"] for terms in told])
     assert progress[50:100].min() > 0.02  # not in steps of the line's stations, half a metre apart
     assert progress.max() < 1.1 * 3.0 * 0.04
+    assert 14.0 < progress.sum() < 15.6  # who rolls on behind the end of the line gains nothing
     (arrival,) = [terms for terms in told if terms["arrived"]]
     assert arrival["left_m"] == pytest.approx(1.0, abs=0.5)  # the way-point's radius
 
