@@ -71,7 +71,12 @@ class Host:
     ) -> None:
         self.wire, self.seed, self._faults = wire, seed, faults
         self.module: Module = make_module(wire)
-        cls = type(self.module)
+        cls, dt_s = type(self.module), wire.every * store.tick_ns * 1e-9
+        if cls.pace_s is not None and abs(cls.pace_s - dt_s) > 1e-9:
+            raise ModuleError(
+                f"{wire.component}: {wire.module} was made for a step every {cls.pace_s:g} s, here it is {dt_s:g} s; "
+                "change `every` in the stack, or train anew"
+            )
         due = math.gcd(wire.every, wire.latency_cycles)  # whoever waits for it waits for what it commits later, too
         self.component: Component = store.join(
             wire.component, participant=participant, every=due, phase=wire.phase % due
@@ -105,7 +110,7 @@ class Host:
         self._steps = self._missed = 0
         self.module.rng = self._rng = seeded(seed, wire.component)
         self.rng_before: Mapping[str, Any] | None = None  # state of the generator before the step, for a repro
-        self.module.dt_s = wire.every * store.tick_ns * 1e-9
+        self.module.dt_s = dt_s
         self._last: dict[str, tuple[int, Any]] = {}  # write number and value of each input
         self._pending: deque[Result] = deque()
         self._started = False

@@ -186,6 +186,8 @@ class Module(ABC):
     outputs: ClassVar[dict[str, OutputPort[Any]]] = {}
     params: ClassVar[dict[str, ParamPort[Any]]] = {}
 
+    pace_s: ClassVar[float | None] = None
+    """Time between steps that the module is made for; None for any."""
     t_ns: int = 0
     """Time of this step: the edge of its cycle, ns since 1970."""
     dt_s: float = 0.0

@@ -102,6 +102,11 @@ class Seat(Module):
         return self._looked[1]
 
     @property
+    def steering(self) -> float:
+        """The steering of the last action, full right to full left in [-1, 1]; 0 for who does not steer."""
+        return 0.0
+
+    @property
     def estimate(self) -> Pose | None:
         """The pose that it said last, if that is its task."""
         return self._estimate
@@ -160,6 +165,11 @@ class DriverSeat(Seat):
     drive = Output(DriveCommand, safe=STOP)
     state = Output(FollowState, safe=FollowState())
 
+    @property
+    def steering(self) -> float:
+        """The steering of the last action."""
+        return self.action[1]
+
     def see(self) -> list[float]:
         """Give the numbers of the features."""
         place = self.place()
@@ -189,6 +199,11 @@ class PedalSeat(DriverSeat):
     sees: ClassVar[tuple[Feature, ...]] = (*DriverSeat.sees[:-1], Feature("action", 3, -1.0, 1.0, ACTION.doc))
     n_actions: ClassVar[int] = 3
     pedals = Output(PedalCommand, safe=PedalCommand(brake=0.27))
+
+    @property
+    def steering(self) -> float:
+        """The steering of the last action."""
+        return self.action[0]
 
     def act(self, action: Sequence[float]) -> None:
         """Steering, full right to full left; throttle, 0 to 1 above 0; brake, 0 to 0.3 above 0."""

@@ -242,7 +242,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         return Referee(drive.sim, site.value, drive.simulated.course, OFF_COURSE_M.get(self.agent, 3.0))
 
     def _judge(self, drive: Drive, seat: Seat) -> tuple[Reward, End]:
-        reward, end = self.referee.judge(self.dt_s, seat.action[-1], seat.estimate)
+        reward, end = self.referee.judge(self.dt_s, seat.steering, seat.estimate)
         if self._recorder is not None:
             self._reward.write(reward, drive.world.now_ns)
         return reward, end

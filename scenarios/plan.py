@@ -92,9 +92,7 @@ def map_record(site: Site, boxes: tuple[ObstacleSetup, ...]) -> Scene:
     return scene_of(seen, {k: terrain.height_m(b.east_m, b.north_m) for k, b in enumerate(seen.all_obstacles())})
 
 
-def sim_setup(
-    scenario: Scenario, site: Site, level: Level, plant: PlantKind, rng: Rng, drawn: Randomised
-) -> SimSetup:
+def sim_setup(scenario: Scenario, site: Site, level: Level, plant: PlantKind, rng: Rng, drawn: Randomised) -> SimSetup:
     """Give the simulated cart: it starts near its mark, as well as the crew puts it there."""
     mark, start, laser = scenario.start, rng("start").normal(size=3), scenario.laser
     return SimSetup(

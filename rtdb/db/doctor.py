@@ -180,8 +180,8 @@ OTHERS = (  # what our imports, and theirs, are called; tests/rtdb/test_doctor.p
     "PIL", "attr", "attrs", "click", "cloudpickle", "contourpy", "cv2", "cycler", "dateutil", "farama_notifications",
     "filterpy", "fontTools", "google", "gymnasium", "kiwisolver", "lz4", "matplotlib", "mcap", "msgspec", "numpy",
     "packaging", "pyarrow", "pybullet", "pybullet_data", "pydantic", "pydantic_core", "pygeomag", "pygments",
-    "pyparsing", "pytest", "rerun", "rich", "ruamel", "scipy", "shellingham", "six", "stable_baselines3", "torch", "typer",
-    "typing_extensions", "typing_inspection", "annotated_types", "zstandard",
+    "pyparsing", "pytest", "rerun", "rich", "ruamel", "scipy", "shellingham", "six", "stable_baselines3", "torch",
+    "typer", "typing_extensions", "typing_inspection", "annotated_types", "zstandard",
 )  # fmt: skip
 
 

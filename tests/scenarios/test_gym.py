@@ -1,4 +1,4 @@
-"""A gymnasium environment is a scenario made steppable: the same drive, byte for byte, and what the checkers ask for."""
+"""A gymnasium environment is a scenario made steppable: the same drive, to the byte, and what the checkers ask for."""
 
 import math
 import resource
@@ -306,7 +306,7 @@ def test_collision_terminates(tmp_path: Path) -> None:
     assert (terminated, truncated, info["end"]) == (True, False, "collision")
 
 
-# -- randomisation, observations, pictures ------------------------------------------------------------------------------
+# -- randomisation, observations, pictures ----------------------------------------------------------------------------
 
 
 def randomised(straight: str, folder: Path, kind: Any, seed: int) -> Randomised:
