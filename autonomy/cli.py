@@ -47,8 +47,12 @@ def repro(
 
     Exit status: 0 the step passed or the debugger was left, 1 it broke again, 2 bad input.
     """
-    from .repro import load
+    from .module import ModuleError
+    from .repro import SUFFIX, load
 
+    if file.is_dir():
+        kept = ", ".join(str(path) for path in sorted(file.glob(f"*{SUFFIX}")))
+        raise ModuleError(f"{file} is a folder; " + (f"it holds {kept}" if kept else f"it holds no {SUFFIX} file"))
     module, document = load(file)
     call = str(document["call"])
     typer.echo(f"{document['component']}: {call}() of {document['wire']['module']}")

@@ -43,6 +43,7 @@ CONFIG_BYTES, SHOW_BYTES = 2000, 2000
 REASON_BYTES = 160  # as ModuleStatus has it
 OWN_FILES = Path(__file__).parent, ("host.py", "module.py")  # their lines tell a student nothing
 FOREVER_NS = 1 << 62
+NOT_YET = "is not there yet"
 JSON_EDGES = 3  # so many of its writer's edges old may a JSON input be that has no max_age_s
 watch = Watch()
 
@@ -113,7 +114,7 @@ class Host:
         self.module.dt_s = dt_s
         self._last: dict[str, tuple[int, Any]] = {}  # write number and value of each input
         self._pending: deque[Result] = deque()
-        self._started = False
+        self._started, self._without = False, ""
         self._streams = capped(wire.component)
         self._status.write(ModuleStatus())
 
@@ -228,7 +229,7 @@ class Host:
             self._pending.append(result)
         else:
             self._commit(result)
-        self._say(ModuleState.RUNNING, "")
+        self._say(ModuleState.RUNNING, self._without)
 
     def _guarded(self, call: Callable[[], None], before: dict[str, Any] | None = None) -> bool:
         """Call the module; False if that went wrong. Its prints are capped, and an endless loop is ended."""
@@ -254,7 +255,7 @@ class Host:
     def _read(self, cycle: int, now_ns: int) -> str:
         """Put the inputs of this cut into the module; returns what is absent, empty if nothing is."""
         module = self.module
-        before = dict(module.samples)
+        before, without = dict(module.samples), list[str]()
         module.samples.clear()
         for name, port, found, max_age_ns in self._inputs:
             absent = self._take(name, found, max_age_ns, cycle, now_ns, before.get(name))
@@ -262,6 +263,9 @@ class Host:
                 return f"input {name} ({inputs_of(type(module), self.wire.inputs)[name]}) {absent}"
             if absent:
                 module.__dict__[name] = None
+                if found is not None and absent is not NOT_YET:
+                    without.append(name)
+        self._without = f"without {', '.join(without)}: too old, or not usable" if without else ""
         return ""
 
     def _take(
@@ -269,13 +273,13 @@ class Host:
     ) -> str:
         """Put one input into the module; returns why it is absent, empty if it is there."""
         if found is None:
-            return "is not there yet"
+            return NOT_YET
         try:
             sample = found.obj.visible_since(cycle, before)
         except RtdbError as error:  # aged out, or no JSON
             return f"cannot be read: {error}"
         if sample is None:
-            return "is not there yet"
+            return NOT_YET
         age_ns = now_ns - (sample.t_commit_ns if found.json else sample.t_data_ns)
         if age_ns > max_age_ns:
             return f"is {age_ns * 1e-9:.2f} s old, at most {max_age_ns * 1e-9:g} s"
@@ -301,7 +305,11 @@ class Host:
                 raise ModuleError(f"output {name} was not assigned in this step")
             if type(value) is not port.cls:
                 raise ModuleError(f"output {name} is a {port.cls.__name__}, got {value!r:.60}")
-            if not is_sound(value):
+            try:
+                fits = is_sound(value)
+            except TypeError:  # a field holds something else than its number
+                fits = False
+            if not fits:
                 raise ModuleError(f"output {name} {what_is_wrong(value, port.ranges)}")
             payloads.append(writer.schema.pack(value))
         return payloads

@@ -115,7 +115,10 @@ def check_inputs(component: str, cls: type[Module], inputs: dict[str, str]) -> N
     wired = inputs_of(cls, inputs)
     for name, port in cls.inputs.items():
         if name not in wired and not port.optional:
-            raise ModuleError(f"{component}: input {name} of {cls.__name__} is not wired")
+            raise ModuleError(
+                f"{component}: input {name} of {cls.__name__} is not wired; wire it in the stack file, or say "
+                f"pointer=... in the port"
+            )
 
 
 def inputs_of(cls: type[Module], wired: dict[str, str]) -> dict[str, str]:

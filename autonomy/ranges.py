@@ -62,6 +62,8 @@ def what_is_wrong(value: Record, ranges: Ranges) -> str:
     for f in schema_of(type(value)).fields:
         low, high = range_of(f, ranges)
         number = getattr(value, f.name)
+        if f.spec.kind not in NO_NUMBERS and f.spec.shape == "one" and not isinstance(number, int | float):
+            return f"{f.name} is a number [{f.spec.unit or '1'}], got {number!r:.60}"
         if f.spec.kind not in NO_NUMBERS and f.spec.shape != "one" and not math.isfinite(sum(number)):
             return f"is not finite: {f.name} = {number!r:.100}"
         if f.spec.kind in NO_NUMBERS or f.spec.shape != "one" or not math.isfinite(number):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from hal.bus import Level
 from hal.drivers.compass import CompassDriver
 from hal.drivers.gps import GpsDriver
-from hal.host import CartHost, CompassHost, GpsHost
+from hal.host import CartHost, CompassHost, GpsHost, ahead_ns
 from hal.signals import (
     ActorsTruth,
     CartTruth,
@@ -130,10 +130,10 @@ class SimulatedCart:
         while self._events and self._events[0][0] <= t_ns:
             self._fault.write(self._events.pop(0)[1], t_ns)
 
-    def _write_scan(self, _cycle: int, t_ns: int) -> None:
+    def _write_scan(self, cycle: int, t_ns: int) -> None:
         scan = self.sim.scan()
         if scan is not None and self._scan is not None:
-            self._scan.write(scan, t_ns)
+            self._scan.write(scan, t_ns + ahead_ns(self.cart, cycle, t_ns))
 
     def close(self) -> None:
         """Give the world back."""

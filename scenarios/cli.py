@@ -94,6 +94,8 @@ def drive(
         raise typer.BadParameter(f"{placement!r} is not one of inline, process", param_hint="--placement")
     if by_hand and not sys.stdin.isatty():
         raise typer.BadParameter("the keyboard is needed: standard input is not a terminal", param_hint="--by-hand")
+    if scenario.partition(":")[0].endswith(".py"):
+        raise typer.BadParameter(f"{scenario} is a module; put it into a stack with --use COMPONENT=FILE.py:Class")
     plan = load_scenario(scenario)
     stack = stack_with(plan.stack_path(), use or [])
     folder = out / plan.id / str(seed)
@@ -110,9 +112,8 @@ def drive(
         pace = 1.0
     result = _drive(setup, folder, pace or (4.0 if view else None), console, view)
     show(console, result)
-    for kept in sorted(folder.glob("*.repro")):
-        console.print(f"fairway repro {kept}  runs just the step that broke again", highlight=False, soft_wrap=True)
-    after_drive(console, folder, scenario, seed)
+    same = "".join(f" --use {swap}" for swap in use or ()) + (f" --level {level}" if level != "wire" else "")
+    after_drive(console, folder, scenario, seed, same)
     raise typer.Exit({"PASS": PASS, "FAIL": FAIL, "UNKNOWN": FAIL}.get(result.verdict, BROKEN))
 
 
@@ -135,7 +136,7 @@ def _drive(setup: "Setup", folder: Path, pace: float | None, console: "Console",
             from .replay import LiveView
 
             lives.append(held.enter_context(LiveView(stores, f"{setup.scenario.id}, seed {setup.seed}")))
-            print(lives[0].viewer.address, flush=True)
+            print(f"open in a browser: {lives[0].viewer.address}", flush=True)
             return lives[0]
 
         lost = _run_drive(setup, recording, pace, console, begin)
@@ -145,7 +146,10 @@ def _drive(setup: "Setup", folder: Path, pace: float | None, console: "Console",
         write_plots(whole, folder, result)
         for live in lives:
             live.show(result)
-            console.print(f"{result.verdict}: look around; close the viewer or press Ctrl-C to go on")
+            if not console.is_terminal:
+                console.print(f"{result.verdict}: this is no terminal, so the viewer ends here; see fairway replay")
+                continue
+            console.print(f"{result.verdict}: look around in the browser; close the viewer or press Ctrl-C to go on")
             live.viewer.wait()
     return result
 

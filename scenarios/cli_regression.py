@@ -139,7 +139,7 @@ def show_report(console: "Console", report: "Report") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from .report import COLOUR
+    from .report import COLOUR, print_line
 
     table = Table(box=None, pad_edge=False)
     for heading in ("scenario", "seed", "verdict", "golden", "what broke"):
@@ -158,19 +158,15 @@ def show_report(console: "Console", report: "Report") -> None:
     for outcome in report.outcomes:
         head = f"{outcome.result.scenario} seed {outcome.result.seed}"
         for text in outcome.say_moves():
-            _line(console, f"{head}: {text}")
+            print_line(console, f"{head}: {text}")
         if not outcome.good:
             plots = f" and {', '.join(path.name for path in outcome.plots)} there" if outcome.plots else ""
-            _line(console, f"{head}: look at it: fairway replay {outcome.task.folder}{plots}")
+            print_line(console, f"{head}: look at it: fairway replay {outcome.task.folder}{plots}")
     for text in report.updates:
-        _line(console, f"golden: {text}")
+        print_line(console, f"golden: {text}")
     total = len(report.outcomes)
     said = f"all {total} good" if not bad else f"{len(bad)} of {total} to look at"
-    _line(console, f"{said}, {report.wall_s:.1f} s")
-
-
-def _line(console: "Console", text: str) -> None:
-    console.print(text, highlight=False, soft_wrap=True, markup=False)
+    print_line(console, f"{said}, {report.wall_s:.1f} s")
 
 
 def _grouped(outcomes: "tuple[Outcome, ...]") -> "list[list[Outcome]]":
@@ -251,22 +247,23 @@ def schema() -> None:
     typer.echo(json.dumps(scenario_schema(), indent=1))
 
 
-def after_drive(console: "Console", folder: Path, scenario: str, seed: int) -> None:
-    """Print where a drive's files are, and the three commands worth trying next. `scenario`: as the user named it."""
-    plots = sorted(path.name for path in folder.glob("*.png"))
-    _line(console, f"recording  {folder / 'run.mcap'}")
-    _line(console, f"result     {folder / 'result.json'}")
-    if plots:
-        _line(console, f"plots      {folder}: {', '.join(plots)}")
+def after_drive(console: "Console", folder: Path, scenario: str, seed: int, same: str = "") -> None:
+    """Print where a drive's files are, and the three commands worth trying next.
+
+    scenario: as the user named it; same: the options that another drive of the same kind needs.
+    """
+    from .report import print_files, print_line
+
+    print_files(console, folder)
     other = next((path.parent for path in sorted(folder.parent.glob("*/run.mcap")) if path.parent != folder), None)
     commands = [
         (f"fairway replay {folder}", "see what the cart saw, believed and did"),
-        (f"fairway drive {scenario} --seed {seed + 1}", "drive with other randomness"),
+        (f"fairway drive {scenario}{same} --seed {seed + 1}", "drive with other randomness"),
         (f"fairway diff {other} {folder}", "see where this drive and another part")
         if other
         else ("fairway check --tag smoke", "drive a set and compare with golden metrics"),
     ]
     wide = max(len(command) for command, _ in commands)
-    _line(console, "try next")
+    print_line(console, "try next")
     for command, purpose in commands:
-        _line(console, f"  {command:{wide}}  {purpose}")
+        print_line(console, f"  {command:{wide}}  {purpose}")

@@ -90,7 +90,7 @@ def _run(setup: "RunSetup") -> int:
 
     from .cart import DriveError
     from .folder import Interrupted, clear, locked
-    from .report import show
+    from .report import print_files, show
     from .supervisor import supervise
 
     console = Console()
@@ -114,7 +114,7 @@ def _run(setup: "RunSetup") -> int:
     show(console, result)
     late = ", ".join(f"{name} {n}" for name, n in sorted(outcome.late.items()))
     console.print(f"ended: {outcome.ended}; cycles missed: {late or 'none'}", highlight=False, soft_wrap=True)
-    console.print(f"recording  {recording}", highlight=False, soft_wrap=True)
+    print_files(console, setup.folder)
     return {"PASS": PASS, "FAIL": FAIL, "UNKNOWN": FAIL}.get(result.verdict, BROKEN)
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from autonomy.features import TRUTH, Feature, Flat, described
 from autonomy.loading import make_module
+from autonomy.module import ModuleError
 from autonomy.seats import SEATS, Seat
 from autonomy.wiring import Stack, stack_with
 from hal.bus import Level
@@ -83,7 +84,10 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         self.render_mode, self.level, self.randomise, self.seeds = render_mode, level, randomise, seeds
         self.scenario, self.agent, self.tier = load_scenario(scenario), agent, tier
         path = STACKS / WHOLE[agent] if agent in WHOLE else self.scenario.stack_path()
-        self.stack = stack_with(path, list(use))
+        use = [use] if isinstance(use, str) else list(use)
+        if any(swap.partition("=")[0] == agent for swap in use):
+            raise ValueError(f"use={use!r}: {agent} is the agent, who is asked from outside; see run_module")
+        self.stack = stack_with(path, use)
         wire = next((w for w in self.stack.wires if w.component == agent), None)
         if wire is None:
             names = ", ".join(w.component for w in self.stack.wires)
@@ -135,7 +139,9 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         drive, seat = self._running()
         chosen = np.asarray(action, dtype=np.float64)
         if chosen.shape != (self.seat.n_actions,) or not np.isfinite(chosen).all():
-            raise ValueError(f"an action is {self.seat.n_actions} finite numbers in [-1, 1], got {action!r:.80}")
+            raise ValueError(
+                f"an action is {self.seat.n_actions} finite numbers, clipped to [-1, 1]; got {action!r:.80}"
+            )
         seat.chosen = tuple(np.clip(chosen, -1.0, 1.0).tolist())
         assert drive.agent is not None
         drive.agent.finish()
@@ -308,25 +314,32 @@ def run_module(
     env: gymnasium.Env[Any, Any],
     module: str,
     seed: int,
-    recording: Path,
+    recording: str | Path,
     placement: Literal["inline", "process"] = "inline",
 ) -> str:
     """Drive one episode of an environment with a module (FILE.py:Class) as its agent; returns the hash of the trace.
 
     The whole drive, from its first cycle on, goes into the recording: its trace is that of `fairway drive` with the
-    module in the stack. placement: the other modules here, or each in a process of its own.
+    module in the stack. placement: the other modules here, or each in a process of its own. ModuleError if the module
+    broke; the step that broke it is saved beside the recording.
     """
     from rtdb.recording import Recording
 
     cart = env.unwrapped
     assert isinstance(cart, CartEnv)
+    recording = Path(recording)
     cart.reset(seed=seed)  # the world is that of this seed, and nobody else's episode is under way
-    setup = replace(cart.setup_of(seed, cart.stack.use(cart.agent, module), True), placement=placement)
+    setup = replace(
+        cart.setup_of(seed, cart.stack.use(cart.agent, module), True), placement=placement, faults=recording.parent
+    )
     with Drive(setup) as drive, Recorder(recording, [drive.cart, drive.world], metadata(setup)) as recorder:
         while not go_on(drive, recorder):
             assert drive.agent is not None
             drive.agent.finish()
+        fault = drive.agent.fault if drive.agent is not None else ""
     cart.forget()
+    if fault:
+        raise ModuleError(f"{cart.agent} = {module} broke: {fault}; the recording up to the end is in {recording}")
     return Recording(recording).trace_hash()
 
 

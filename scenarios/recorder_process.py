@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rtdb import RtdbError, Store
+from rtdb import Object, RtdbError, Store
 from rtdb.recorder import Recorder
 
 from .clock_process import ended, lives
@@ -18,6 +18,7 @@ from .clock_process import ended, lives
 TICKS = 5  # from one look to the next: shorter than any history
 BEHIND = 30  # cycles: a store that is so far behind the other stands, and is waited for no longer
 LOOK_S = 0.1
+FOREVER = 1 << 62
 
 
 def run(job: dict[str, Any]) -> int:
@@ -28,13 +29,14 @@ def run(job: dict[str, Any]) -> int:
                 return 0  # nothing ever happened
         told_to_end = False
         cart.join("recorder")  # so that tools see it
+        orders = cart.find("supervisor/orders")
         with Recorder(Path(job["file"]), [cart, world], job["metadata"]) as recorder:
             while not (told_to_end and not lives(cart, "hal")):
                 if cart.wait_cycle(cart.cycle + TICKS - 1, LOOK_S) is None and not cart.clock.alive:
                     time.sleep(LOOK_S)  # nobody ticks: the world may go on by itself
-                recorder.catch_up(_until(cart.cycle, world.cycle))
+                recorder.catch_up(min(_until(cart.cycle, world.cycle), _last(orders)))
                 told_to_end = told_to_end or ended()
-            recorder.catch_up(max(cart.cycle, world.cycle))
+            recorder.catch_up(min(max(cart.cycle, world.cycle), _last(orders)))
             if recorder.lost:
                 print(f"recorder: came too late for {recorder.lost} writes", file=sys.stderr, flush=True)
     return 0
@@ -43,6 +45,12 @@ def run(job: dict[str, Any]) -> int:
 def _until(cart: int, world: int) -> int:
     """Say up to which cycle both stores are known, or will not be."""
     return max(min(cart, world), max(cart, world) - BEHIND)
+
+
+def _last(orders: Object[Any]) -> int:
+    """Give the last cycle of the drive: how the supervisor stops the cart after it is no part of it."""
+    sample = orders.latest()
+    return int(sample.value.get("recorded", FOREVER)) if sample is not None else FOREVER
 
 
 def main() -> int:

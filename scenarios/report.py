@@ -1,6 +1,7 @@
 """What a drive prints: a table of criteria, and where things are."""
 
 import math
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -51,3 +52,19 @@ def show(console: Console, result: Result) -> None:
     console.print(
         f"[bold {colour}]{result.verdict}[/] after {result.duration_s:.1f} s of driving{reason}", highlight=False
     )
+
+
+def print_files(console: Console, folder: Path) -> None:
+    """Print where a drive's files are, and how to run a step again that broke a module."""
+    for kept in sorted(folder.glob("*.repro")):
+        print_line(console, f"fairway repro {kept}  runs just the step that broke again")
+    plots = sorted(path.name for path in folder.glob("*.png"))
+    print_line(console, f"recording  {folder / 'run.mcap'}")
+    print_line(console, f"result     {folder / 'result.json'}")
+    if plots:
+        print_line(console, f"plots      {folder}: {', '.join(plots)}")
+
+
+def print_line(console: Console, text: str) -> None:
+    """Print a line as it is: no markup, no colours, no wrapping."""
+    console.print(text, highlight=False, soft_wrap=True, markup=False)

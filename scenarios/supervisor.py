@@ -28,7 +28,7 @@ from autonomy.process import READY, spawn
 from autonomy.wiring import Stack, Wire, required, wire_of
 from hal.bus import Level
 from hal.errors import HalError
-from hal.signals import FollowState, GuardState, ModuleStatus, Odometry, SafetyState, SystemState
+from hal.signals import FollowState, GuardState, ModuleState, ModuleStatus, Odometry, SafetyState, SystemState
 from rtdb import Record, RtdbError, State, Store, Writer
 
 from .cart import TICK_NS, DriveError
@@ -43,6 +43,8 @@ R = TypeVar("R", bound=Record)
 Kind = Literal["clock", "hal", "recorder", "module"]
 PRIORITY: dict[Kind, int | None] = {"clock": 80, "hal": 70, "module": 60, "recorder": None}
 RESTARTS, RESTARTS_S = 3, 10.0
+HANG_CYCLES = 200  # a module that finished nothing for so long hangs
+TELL_S = 10.0
 START_S = 90.0  # until the first tick
 LOOK_S = 0.1
 STAND_S = 15.0  # for the limits to bring the cart to a stand
@@ -224,20 +226,23 @@ class Supervisor:
         """Look after everybody until the drive is over, or somebody asks for its end; then stop the cart."""
         setup, settled_s, outcome = self.setup, 0.0, None
         longest_s = setup.for_s if setup.for_s is not None else setup.scenario.duration_s
-        cycle = 0
+        cycle, told_s = 0, 0.0
         while outcome is None:
             cycle = self.cart.wait_cycle(cycle + 9, LOOK_S) or self.cart.cycle
             now_s = cycle * TICK_NS * 1e-9
             self._note_required()
             lost = self._look_after()
             why = self._asked()
+            if now_s >= told_s + TELL_S:
+                told_s = now_s
+                self._say(self._progress(now_s))
             settled_s = (settled_s or now_s) if self.stands and self._is_over() else 0.0
             if lost:
                 outcome = Outcome(lost, lost)
             elif why:
                 outcome = Outcome(why, interrupted=True)
             elif settled_s and now_s - settled_s >= SETTLE_S:
-                outcome = Outcome("the cart stands, and nothing will move it")
+                outcome = Outcome(f"the cart stands, and nothing will move it{self._blame()}")
             elif now_s >= longest_s:
                 outcome = Outcome(f"{now_s:.0f} s are over")
         late = {info.name: info.missed for info in self.cart.components() if info.missed}
@@ -253,6 +258,14 @@ class Supervisor:
         order: dict[Kind, int] = {"clock": 0, "hal": 1, "module": 2, "recorder": 3}  # causes before effects
         for child in sorted(self._children.values(), key=lambda child: order[child.kind]):
             code = child.process.poll()
+            if code is None and not child.gone and (hangs := self._hangs(child)):
+                if child.name in self._required:
+                    self._say(f"{hangs}; {Do.STOP.value}")
+                    return hangs
+                self._say(f"{hangs}; it is ended")
+                child.process.kill()
+                child.process.wait()
+                code = child.process.poll()
             if code is None or child.gone:
                 continue
             now_s = time.monotonic()
@@ -270,6 +283,26 @@ class Supervisor:
             if do is Do.RESTART:
                 child.restarts_s.append(now_s)
                 self._restart(child)
+        return ""
+
+    def _hangs(self, child: Child) -> str:
+        """Say that a module lives, but has finished no cycle for a while; empty if it has."""
+        if child.kind != "module" or not self.cart.cycle:
+            return ""
+        info = next((info for info in self.cart.components() if info.name == child.name), None)
+        if info is None or not info.alive or not info.participant:
+            return ""
+        late = self.cart.cycle - info.done
+        if late <= max(HANG_CYCLES, 3 * info.every):
+            return ""
+        return f"{child.name} hangs: the last cycle that it finished is {info.done}, {late * TICK_NS * 1e-9:.1f} s ago"
+
+    def _blame(self) -> str:
+        """Say which of the modules that the cart drives by does not run, and why; empty if all do."""
+        for name in sorted(self._required):
+            status = self._newest(f"{name}/status", ModuleStatus) if self._has(f"{name}/status") else None
+            if status is not None and status.state is not ModuleState.RUNNING:
+                return f": {name} is {status.state.name}: {status.reason}"
         return ""
 
     def _restart(self, child: Child) -> None:
@@ -306,6 +339,14 @@ class Supervisor:
             if obj.schema.name in ends and obj.component in self._required
         )
 
+    def _progress(self, now_s: float) -> str:
+        """Say how far it has come."""
+        travel = self._newest("odometry/travel", Odometry)
+        states = [obj.name for obj in self.cart.objects("*/state") if obj.schema.name == FollowState.__name__]
+        follow = self._newest(states[0], FollowState) if states else None
+        speed = f", {travel.speed_mps:.1f} m/s" if travel is not None else ""
+        return f"{now_s:4.0f} s{speed}" + (f", towards way-point {follow.waypoint + 1}" if follow is not None else "")
+
     def _newest(self, name: str, cls: type[R]) -> R | None:
         sample = self.cart.find(name, cls).latest()
         return sample.value if sample is not None else None
@@ -323,15 +364,16 @@ class Supervisor:
             if self.stands or (moved is None and not self.cart.clock.alive):
                 break  # without a clock hal stops it by itself
             cycle = moved or cycle
-        self._order_stop(outcome.ended)
+        self._order_stop(outcome.ended, recorded=None if outcome.lost or outcome.interrupted else self.cart.cycle)
         try:
             hal.wait(END_S)
         except subprocess.TimeoutExpired:
             self._say(f"hal did not end within {END_S:.0f} s of being asked to stop the cart, and is ended")
 
-    def _order_stop(self, why: str) -> None:
-        """Ask hal to stop the cart, and to end."""
-        self._orders.write({"stop": why.encode()[:100].decode(errors="ignore")})
+    def _order_stop(self, why: str, recorded: int | None = None) -> None:
+        """Ask hal to stop the cart, and to end. recorded: the last cycle that is part of the drive."""
+        order: dict[str, Any] = {"stop": why.encode()[:100].decode(errors="ignore")}
+        self._orders.write(order if recorded is None else order | {"recorded": recorded})
 
     def close(self, *, wait: bool = True) -> None:
         """Stop the cart if it is not stopped yet, end all processes, the clock last, and remove the stores' names."""

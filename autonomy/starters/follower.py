@@ -32,7 +32,8 @@ class Follower(Module):
         dx_m, dy_m = x_m - self.pose.x_m, y_m - self.pose.y_m
         distance_m = math.hypot(dx_m, dy_m)
         last = self._next == len(self.course.lat_rad) - 1
-        finished = last and distance_m < 1.0
+        near_m = max(1.0, self.course.radius_m[-1] / 2)  # its target radius, with room for what GPS gets wrong
+        finished = last and distance_m < near_m
         if distance_m < 2.0 and not last:
             self._next += 1
         # How far the way-point is to the left of where the cart looks; wrap() keeps it within half a turn.

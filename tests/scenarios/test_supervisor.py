@@ -28,6 +28,20 @@ class Watcher(Module):
     def step(self):
         self.seen = GuardState()
 '''
+HANGS = '''\
+import time
+
+from autonomy.follow import Follow
+
+
+class Hangs(Follow):
+    """Hangs where Python cannot end it."""
+
+    def step(self):
+        if self.pose.x_m > 2.0:
+            time.sleep(1e9)
+        super().step()
+'''
 STACKS = Path(__file__).resolve().parents[2] / "autonomy" / "stacks"
 
 
@@ -165,3 +179,19 @@ def test_who_ends_the_run_stops_the_cart_first(live):
     assert last < 0.01
     run.until_all_are_gone()
     assert run.left_behind() == []
+
+
+def test_required_module_that_hangs_is_named_and_the_cart_stands(live, tmp_path):
+    stack = json.loads((STACKS / "reference.json").read_text())
+    stack["follow"]["module"] = "hangs.py:Hangs"
+    (tmp_path / "hangs.py").write_text(HANGS)
+    (tmp_path / "stack.json").write_text(json.dumps(stack))
+    run = live(metres=30, stack="stack.json")
+    assert run.ended() == 3, run.printed
+    result = json.loads(run.recording.with_name("result.json").read_text())
+    assert result["verdict"] == "ERROR"
+    assert "follow hangs: the last cycle that it finished is" in result["reason"]
+    fastest, last = end_of(run)
+    assert fastest > 0.5
+    assert last < 0.01
+    run.until_all_are_gone()
