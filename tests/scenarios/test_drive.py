@@ -181,6 +181,7 @@ def test_spy_would_find_the_truth_if_it_were_shared() -> None:
 
 def test_process_of_modules_cannot_find_the_truth(short: Scenario) -> None:
     name = name_of("two-stores")
+    others = set(spy())  # a run in real time on this machine may share its truth
     with Drive(Setup(scenario=short, placement="process", db=name)) as run:
         while run.cart.cycle < 50:
             run.tick()
@@ -193,7 +194,8 @@ def test_process_of_modules_cannot_find_the_truth(short: Scenario) -> None:
     mine = seen[f"fairway-{os.getuid()}-{name}"]
     assert {"localise", "follow", "guard", "gps"} <= set(mine["components"])
     assert "Pose" in mine["records"]
-    for segment, what in seen.items():
+    for segment in seen.keys() - others:
+        what = seen[segment]
         assert "world" not in what["components"], segment
         assert "CartTruth" not in what["records"], segment
         assert what["text"] == [], segment
