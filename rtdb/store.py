@@ -18,7 +18,7 @@ from typing import Any, Literal, Self, TypeVar, cast, overload
 from . import _core
 from .clock import ClockInfo, Kind, RunningClock
 from .components import Component, ComponentInfo
-from .errors import Deleted, NotOwner, ObjectMissing, RecordError, StoreMissing
+from .errors import Deleted, NotOwner, ObjectMissing, RecordError, RtdbError, StoreMissing
 from .objects import Object, Sample, Writer
 from .records import Record, Schema
 from .watch import Query, Watch, search
@@ -242,12 +242,19 @@ class Store:
             try:
                 found: Object[R] = Object(self, self.core.find(name), cls)
                 break
-            except (ObjectMissing, Deleted):
+            except (ObjectMissing, Deleted) as error:
                 left_ns = int((deadline - time.monotonic()) * 1e9)
                 if left_ns <= 0 or self.core.wait_directory(version, left_ns) is None:
-                    raise
+                    raise self._with_advice(name, error) from None
         self._objects[key] = found
         return found
+
+    def _with_advice(self, name: str, error: RtdbError) -> RtdbError:
+        """Give the error of a name that is not found, with the one that may be meant."""
+        import difflib
+
+        near = difflib.get_close_matches(name, [obj.name for obj in self.objects()], n=1)
+        return type(error)(f"{error}; did you mean {near[0]}?") if near and near[0] != name else error
 
     def writer(self, name: str, cls: type[R]) -> Writer[R]:
         """Find an object to write: one's own, or a public one."""

@@ -226,7 +226,11 @@ def latency(
     from .run import TICK_NS
     from .scenario import STACKS
 
-    wiring = load_stack(Path(stack) if stack.endswith(".json") else STACKS / f"{stack}.json")
+    path = Path(stack) if stack.endswith(".json") else STACKS / f"{stack}.json"
+    if not path.is_file():
+        shipped = ", ".join(sorted(known.stem for known in STACKS.glob("*.json")))
+        raise typer.BadParameter(f"no stack {stack!r}; there are {shipped}, or give the path of a .json")
+    wiring = load_stack(path)
     tick_ms = TICK_NS / 1e6
     for found in compute(wiring):
         typer.echo(

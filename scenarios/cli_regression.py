@@ -255,7 +255,8 @@ def after_drive(console: "Console", folder: Path, scenario: str, seed: int, same
     from .report import print_files, print_line
 
     print_files(console, folder)
-    other = next((path.parent for path in sorted(folder.parent.glob("*/run.mcap")) if path.parent != folder), None)
+    runs = (path.parent for path in sorted(folder.parent.glob("*/run.mcap")))
+    other = next((run for run in runs if run != folder and not run.name.endswith("-real")), None)
     commands = [
         (f"fairway replay {folder}", "see what the cart saw, believed and did"),
         (f"fairway drive {scenario}{same} --seed {seed + 1}", "drive with other randomness"),
