@@ -319,7 +319,7 @@ BREAKING = {
     "none": (_assign("drive", None), "output drive was not assigned"),
     "unknown port": (_assign("speed", DriveCommand()), "self.speed is not an output; Probe declares drive, state"),
     "does not fit": (_assign("state", FollowState(waypoint=-1)), "waypoint=-1 does not fit"),
-    "text as number": (_assign("drive", DriveCommand(speed_mps="fast")), "TypeError"),  # type: ignore[arg-type]
+    "text as number": (_assign("drive", DriveCommand(speed_mps="fast")), "speed_mps is a number [m/s], got 'fast'"),  # type: ignore[arg-type]
 }
 
 
