@@ -78,9 +78,10 @@ class Flat:
 class Line:
     """The line through a course that the reference follower would drive, and how far along it the cart has come."""
 
-    def __init__(self, site: Site, course: Course) -> None:
+    def __init__(self, site: Site, course: Course, here: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Begin at the course's start mark; where it has none, `here`, in M."""
         plane = LocalPlane.at(site.lat_rad, site.lon_rad)
-        start = plane.to_map(course.start_lat_rad, course.start_lon_rad)
+        start = plane.to_map(course.start_lat_rad, course.start_lon_rad) if course.start_sigma_m > 0 else here
         self.stations: list[Station] = planned_line(site, course, start) if course.lat_rad else []
         self.at = 0
 

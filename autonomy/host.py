@@ -2,8 +2,8 @@
 
 Each due tick: inputs from the cut, the step, outputs checked and committed with inherited data time and lineage. A
 module that raises, gives NaN or a value out of range, assigns something else than its outputs, forgets one, or does
-not end is stopped for good (the fault latches). Its outputs are held for HOLD_STEPS, then the host writes their safe
-values.
+not end is stopped for good (the fault latches). Its outputs are held for as long as their ports declare, then
+the host writes their safe values.
 
 Objects of a component: its outputs; `status`; `config` (its wiring, writable by anybody: the host takes a new one at
 the next due tick or says what is wrong with it); `show` (what the module shows); `timing`, where a budget is declared.
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     import numpy as np
 
 log = logging.getLogger(__name__)
-HOLD_STEPS = 2
 HISTORY_S = 2.0
 CONFIG_BYTES, SHOW_BYTES = 2000, 2000
 REASON_BYTES = 160  # as ModuleStatus has it
@@ -372,9 +371,9 @@ class Host:
         if not self._outputs or not self._outputs[0][2].head:
             return  # nothing was ever said: there is nothing to take back
         self._missed += 1
-        if self._missed > HOLD_STEPS:
-            core = self._store.core
-            for _, port, writer, _ in self._outputs:
+        core = self._store.core
+        for _, port, writer, _ in self._outputs:
+            if self._missed > port.hold_steps:
                 writer.write(port.safe, core.not_before(writer.handle, now_ns))
 
     def _rewire(self, cycle: int) -> None:

@@ -28,6 +28,7 @@ R = TypeVar("R", bound=Record)
 T = TypeVar("T")
 P = TypeVar("P", bool, int, float, str)
 Ranges = Mapping[str, tuple[float, float]]
+HOLD_STEPS = 2  # how long an output is held, where the port does not say
 NO_NUMBERS = ("bool", "enum", "str", "image", "record")
 
 
@@ -65,8 +66,8 @@ class InputPort(Generic[T]):
 class OutputPort(Generic[R]):
     """What a module writes. The host takes the value from the instance after each step."""
 
-    def __init__(self, cls: type[R], safe: R, ranges: Ranges) -> None:
-        self.cls, self.safe, self.ranges = cls, safe, ranges
+    def __init__(self, cls: type[R], safe: R, ranges: Ranges, hold_steps: int) -> None:
+        self.cls, self.safe, self.ranges, self.hold_steps = cls, safe, ranges, hold_steps
 
     @overload
     def __get__(self, module: None, owner: type) -> Self: ...
@@ -166,12 +167,13 @@ def Input(
     return InputPort(cls, unit, ranges, max_age_s, optional, static, pointer)
 
 
-def Output(cls: type[R], *, safe: R, narrow: Ranges | None = None) -> OutputPort[R]:
+def Output(cls: type[R], *, safe: R, narrow: Ranges | None = None, hold_steps: int = HOLD_STEPS) -> OutputPort[R]:
     """Declare an output. `safe` is what the host writes when the module cannot be trusted any more.
 
-    narrow: a range per field, within the record's own; a step that leaves it is a fault.
+    narrow: a range per field, within the record's own; a step that leaves it is a fault. hold_steps: for so many steps
+    that are missed the last value stands, then comes the safe one.
     """
-    return OutputPort(cls, safe, dict(narrow or {}))
+    return OutputPort(cls, safe, dict(narrow or {}), hold_steps)
 
 
 def Param(default: P, *, unit: str = "") -> ParamPort[P]:

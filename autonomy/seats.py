@@ -119,10 +119,11 @@ class Seat(Module):
         """Follow the wheels, and find the place on the line."""
         odometry, before = self.odometry, self._travel
         if self._line is None:
-            self._line = Line(self.site, self.course)
             self._plane = LocalPlane.at(self.site.lat_rad, self.site.lon_rad)
-            self._x_m, self._y_m = self._plane.to_map(self.course.start_lat_rad, self.course.start_lon_rad)
-            self._yaw_rad = self.course.start_yaw_rad
+            if self.course.start_sigma_m > 0:
+                self._x_m, self._y_m = self._plane.to_map(self.course.start_lat_rad, self.course.start_lon_rad)
+                self._yaw_rad = self.course.start_yaw_rad
+            self._line = Line(self.site, self.course, self.place()[:2])
         if before is not None:
             left_m, right_m = odometry.left_m - before.left_m, odometry.right_m - before.right_m
             turn_rad, along_m = (right_m - left_m) / TRACK_M, (left_m + right_m) / 2

@@ -18,7 +18,8 @@ from typing import Any
 import pytest
 
 from autonomy import contain
-from autonomy.host import HOLD_STEPS, Host
+from autonomy.host import Host
+from autonomy.module import HOLD_STEPS
 from autonomy.process import spawn
 from autonomy.wiring import Stack, Wire, load_stack
 from hal.signals import CartTruth, DriveCommand, FollowState, ModuleState, ModuleStatus, ModuleTiming, Pose

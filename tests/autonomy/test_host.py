@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from autonomy import Input, Module, ModuleError, Output, Param
-from autonomy.host import HOLD_STEPS, Host
+from autonomy.host import Host
+from autonomy.module import HOLD_STEPS
 from autonomy.wiring import Wire
 from hal.signals import (
     Course,
@@ -197,6 +198,28 @@ def test_outputs_are_held_then_safe_while_an_input_is_stale() -> None:
     assert held == [DriveCommand(speed_mps=0.1 * 1.5 * 3)] * len(held)
     assert safe == [SAFE] * len(safe)
     assert safe
+
+
+class Patient(Module):
+    """Declares for how long each of its outputs stands."""
+
+    pose = Input(Pose, max_age_s=0.05)
+    drive = Output(DriveCommand, safe=SAFE, hold_steps=0)
+    state = Output(FollowState, safe=FollowState(waypoint=99), hold_steps=5)
+
+    def step(self) -> None:
+        self.drive, self.state = DriveCommand(speed_mps=1.0), FollowState(waypoint=1)
+
+
+def test_each_output_is_held_for_as_many_steps_as_it_declares() -> None:
+    rig = Rig(Patient)
+    rig.ticks(3)
+    rig.ticks(5, pose=False)  # cycle 8 is the last one with a pose that is young enough
+    shown = []
+    for _ in range(8):
+        rig.tick(pose=False)
+        shown.append((rig.value("drive", DriveCommand) == SAFE, rig.value("state", FollowState).waypoint == 99))
+    assert [drive for drive, _ in shown].index(True) + 5 == [state for _, state in shown].index(True)
 
 
 # -- time and lineage -------------------------------------------------------------------------------------------------

@@ -8,8 +8,9 @@ from typing import Any, ClassVar
 import pytest
 
 from autonomy import Input, Module, ModuleError, Output, Param
-from autonomy.host import HOLD_STEPS, Host
+from autonomy.host import Host
 from autonomy.loading import load_module, make_module
+from autonomy.module import HOLD_STEPS
 from autonomy.pointer import field_at
 from autonomy.wiring import Stack, Wire, check_stack, required, stack_with
 from hal.signals import DriveCommand, GpsFix, ModuleState, ModuleStatus, Odometry, Pose, Scan

@@ -104,6 +104,18 @@ def test_checker_passes_for_each_agent_form_and_tier(agent: str, observation: st
     env.close()
 
 
+@pytest.mark.parametrize("agent", ["plan", "follow", "localise", "avoid"])
+def test_every_module_of_the_stack_with_obstacles_can_be_the_agent(agent: str) -> None:
+    env = CartEnv("obstacles/field", agent)
+    observation, _ = env.reset(seed=1)
+    assert env.observation_space.contains(observation)
+    for _ in range(5):
+        observation, _, terminated, _, _ = env.step(np.zeros(env.seat.n_actions))
+        assert env.observation_space.contains(observation)
+        assert not terminated
+    env.close()
+
+
 @pytest.mark.parametrize("mode", ["sync", "async"])
 @pytest.mark.parametrize("autoreset", list(AutoresetMode))
 def test_vector_environments_work_in_every_autoreset_mode(mode: str, autoreset: AutoresetMode, straight: str) -> None:
