@@ -76,6 +76,7 @@ def drive(
     """Drive a scenario and judge it."""
     from rich.console import Console
 
+    from autonomy.module import ModuleError
     from autonomy.wiring import stack_with
 
     from .cli_regression import after_drive
@@ -95,7 +96,7 @@ def drive(
     if by_hand and not sys.stdin.isatty():
         raise typer.BadParameter("the keyboard is needed: standard input is not a terminal", param_hint="--by-hand")
     if scenario.partition(":")[0].endswith(".py"):
-        raise typer.BadParameter(f"{scenario} is a module; put it into a stack with --use COMPONENT=FILE.py:Class")
+        raise ModuleError(f"{scenario} is a module; put it into a stack with --use COMPONENT=FILE.py:Class")
     plan = load_scenario(scenario)
     stack = stack_with(plan.stack_path(), use or [])
     folder = out / plan.id / str(seed)
@@ -220,6 +221,7 @@ def latency(
     stack: Annotated[str, typer.Argument(help="Name of a shipped stack, or path of a .json.")] = "reference",
 ) -> None:
     """Compute the latency from sensors to actuators from a stack's wiring."""
+    from autonomy.module import ModuleError
     from autonomy.wiring import load_stack
 
     from .latency import latency as compute
@@ -229,7 +231,7 @@ def latency(
     path = Path(stack) if stack.endswith(".json") else STACKS / f"{stack}.json"
     if not path.is_file():
         shipped = ", ".join(sorted(known.stem for known in STACKS.glob("*.json")))
-        raise typer.BadParameter(f"no stack {stack!r}; there are {shipped}, or give the path of a .json")
+        raise ModuleError(f"no stack file {path.name} for {stack!r}; there are {shipped}, or give the path of a .json")
     wiring = load_stack(path)
     tick_ms = TICK_NS / 1e6
     for found in compute(wiring):
