@@ -123,6 +123,7 @@ def test_a_drive_arrives_in_real_time_restarts_who_is_not_needed_and_leaves_noth
     assert run.left_behind() == []
 
 
+@pytest.mark.proof
 def test_without_a_required_module_the_limits_stop_the_cart_and_it_is_not_restarted(live):
     run = live(metres=100)
     run.until_it_drives()
@@ -140,6 +141,7 @@ def test_without_a_required_module_the_limits_stop_the_cart_and_it_is_not_restar
     assert run.left_behind() == []
 
 
+@pytest.mark.proof
 def test_without_the_supervisor_hal_stops_the_cart_and_all_processes_end(live):
     run = live(metres=100)
     run.until_it_drives()
@@ -152,6 +154,7 @@ def test_without_the_supervisor_hal_stops_the_cart_and_all_processes_end(live):
     assert last < 0.01
 
 
+@pytest.mark.proof
 def test_without_the_clock_hal_stops_the_cart_on_its_own_time(live):
     run = live(metres=100)
     run.until_it_drives()
@@ -166,6 +169,7 @@ def test_without_the_clock_hal_stops_the_cart_on_its_own_time(live):
     assert run.left_behind() == []
 
 
+@pytest.mark.proof
 def test_who_ends_the_run_stops_the_cart_first(live):
     """By SIGTERM; docs/running.md, which is executed, does it by Ctrl-C."""
     run = live(metres=100)
@@ -181,6 +185,7 @@ def test_who_ends_the_run_stops_the_cart_first(live):
     assert run.left_behind() == []
 
 
+@pytest.mark.proof
 def test_required_module_that_hangs_is_named_and_the_cart_stands(live, tmp_path):
     stack = json.loads((STACKS / "reference.json").read_text())
     stack["follow"]["module"] = "hangs.py:Hangs"
