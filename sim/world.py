@@ -23,6 +23,8 @@ NEAR_M = 5.0
 LOOK_M = 2.0  # what is near enough to be asked about is looked up again when the cart has moved this far
 CART_REACH_M = math.hypot(BODY_LENGTH_M, BODY_WIDTH_M) / 2  # from the middle of the body to its corners
 PERSON_RADIUS_M, PERSON_HEIGHT_M = 0.30, 1.75
+PARKED = (0.0, 0.0, -1000.0)  # out of the way of everything
+SCENES = 64  # kept, so that they can be put up again
 COMPOUND = 16  # pybullet leaves out what is beyond, without a word
 
 
@@ -44,6 +46,9 @@ class World:
         self._bullet = load_bullet()
         self._client: int = self._bullet.connect(self._bullet.DIRECT)
         self._boxes: list[Box] = []
+        self._built: dict[Scene, list[Box]] = {}  # scenes that were put up, also those that are out of the way
+        self._shapes: dict[int, int] = {}  # of the bodies of scenes
+        self._parked: list[int] = []  # bodies of actors that nobody needs now
         self._put_up(scene)
         self._near: list[int] = []  # boxes that the cart can be near to, and their bodies,
         self._near_bodies: list[int] = []
@@ -73,28 +78,57 @@ class World:
             collisionFrameOrientations=[b.getQuaternionFromEuler([0, 0, s.yaw_rad[k]]) for k in indices],
             physicsClientId=self._client,
         )
-        return self._body(int(shape))
+        body = self._body(int(shape))
+        self._shapes[body] = int(shape)
+        return body
 
     def furnish(self, scene: Scene) -> None:
-        """Put up a scene in place of the one before; actors go. The cart has touched nothing yet."""
-        b = self._bullet
-        if scene != self._scene:
-            for body in {box.body for box in self._boxes}:
-                b.removeBody(body, physicsClientId=self._client)
+        """Put up a scene in place of the one before; actors go. The cart has touched nothing yet.
+
+        Nothing is built twice: what goes is moved out of the way, and comes back from there.
+        """
+        if scene is not self._scene and scene != self._scene:
+            for body in self._bodies():
+                self._place(body, PARKED, 0.0)
             self._put_up(scene)
+        self._parked += [body for body, _ in self._actors]
         for body, _ in self._actors:
-            b.removeBody(body, physicsClientId=self._client)
+            self._place(body, PARKED, 0.0)
         self._actors.clear()
         self._collided = False
         self._looked_x_m = self._looked_y_m = math.inf
 
+    @property
+    def bodies(self) -> int:
+        """How many bodies pybullet holds, those that are out of the way too."""
+        return int(self._bullet.getNumBodies(physicsClientId=self._client))
+
+    def _bodies(self) -> set[int]:
+        return {box.body for box in self._boxes}
+
     def _put_up(self, scene: Scene) -> None:
         self._scene = scene
-        self._boxes = []
-        for first in range(0, len(scene.kind), COMPOUND):
-            indices = range(first, min(first + COMPOUND, len(scene.kind)))
-            body = self._compound(indices)
-            self._boxes += [self._box(k, body) for k in indices]
+        known = self._built.pop(scene, None)
+        if known is not None:
+            self._boxes = known
+            for body in self._bodies():
+                self._place(body, (0.0, 0.0, 0.0), 0.0)
+        else:
+            self._boxes = []
+            for first in range(0, len(scene.kind), COMPOUND):
+                indices = range(first, min(first + COMPOUND, len(scene.kind)))
+                body = self._compound(indices)
+                self._boxes += [self._box(k, body) for k in indices]
+        self._built[scene] = self._boxes  # the latest stands last
+        if len(self._built) > SCENES:
+            oldest = next(iter(self._built))
+            for body in {box.body for box in self._built.pop(oldest)}:
+                self._remove(body)
+
+    def _remove(self, body: int) -> None:
+        """Take a body away, and its shape, which pybullet would keep."""
+        self._bullet.removeBody(body, physicsClientId=self._client)
+        self._bullet.removeCollisionShape(self._shapes.pop(body), physicsClientId=self._client)
 
     def _box(self, k: int, body: int) -> Box:
         s = self._scene
@@ -102,12 +136,15 @@ class World:
 
     def add_actor(self, kind: ObstacleKind) -> int:
         """Add a person; `move_actor` says where it is."""
+        self._actors.append((self._parked.pop() if self._parked else self._person(), kind))
+        return len(self._actors) - 1
+
+    def _person(self) -> int:
         b = self._bullet
         shape = b.createCollisionShape(
             b.GEOM_CYLINDER, radius=PERSON_RADIUS_M, height=PERSON_HEIGHT_M, physicsClientId=self._client
         )
-        self._actors.append((self._body(int(shape)), kind))
-        return len(self._actors) - 1
+        return self._body(int(shape))
 
     def move_actor(self, index: int, x_m: float, y_m: float, z_m: float) -> None:
         """Put an actor's feet at a point of M."""

@@ -11,7 +11,7 @@ from sim.plant import CartParams, CartState, Demand, PythonPlant
 from sim.site import Hill, Lane, Obstacle, Site, kerbs, scene_of
 from sim.synlaser import MOUNT_X_M, SynLaser, SynLaserParams
 from sim.terrain import Terrain
-from sim.world import BODY_LENGTH_M, BODY_REAR_M, World
+from sim.world import BODY_LENGTH_M, BODY_REAR_M, PERSON_RADIUS_M, SCENES, World
 
 NOSE_M = BODY_LENGTH_M - BODY_REAR_M
 
@@ -104,3 +104,30 @@ def test_cart_without_brakes_rolls_off_a_hill():
     for _ in range(2000):
         plant.step(Demand(), terrain.ground(plant.state.x_m, plant.state.y_m))
     assert plant.state.x_m > 12.0
+
+
+def test_a_scene_that_is_put_up_again_is_what_it_was_before():
+    """More scenes than are kept, forth and back: each touches, and stops rays, where it stands and nowhere else."""
+    scenes = [scene_of(site(Obstacle(kind="post", east_m=10.0 + k, north_m=0.0))) for k in range(SCENES + 8)]
+    with World(scenes[0]) as world:
+        for k in [*range(1, len(scenes)), 0, *reversed(range(len(scenes)))]:
+            world.furnish(scenes[k])
+            world.add_actor(ObstacleKind.PERSON)
+            world.move_actor(0, 5.0, 8.0, 0.0)
+            world.move_cart(5.0 + k, 0.0, 0.0, 0.0)
+            assert world.clearance().distance_m == pytest.approx(10.0 - 0.15 - 5.0 - NOSE_M, abs=0.01), k
+            ahead, aside = world.rays([(0.0, 2.0, 1.0), (5.0, 2.0, 1.0)], [(100.0, 2.0, 1.0), (5.0, 18.0, 1.0)])
+            assert ahead == 1.0, "nothing stands aside"
+            assert aside == pytest.approx((6.0 - PERSON_RADIUS_M) / 16.0, abs=1e-3), "an actor that came back"
+
+
+def test_a_world_keeps_no_more_bodies_than_the_scenes_that_it_keeps():
+    many = [Obstacle(kind="post", east_m=6.0 * k, north_m=20.0) for k in range(40)]
+    scenes = [scene_of(site(*many, Obstacle(kind="post", east_m=float(k), north_m=0.0))) for k in range(SCENES + 40)]
+    with World(scenes[0]) as world:
+        counts = []
+        for scene in scenes * 2:
+            world.furnish(scene)
+            world.add_actor(ObstacleKind.PERSON)
+            counts.append(world.bodies)
+        assert max(counts) == counts[-1] == 1 + 3 * SCENES + 1
