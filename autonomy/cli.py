@@ -89,7 +89,7 @@ def _debug(module: "Module", call: str) -> int:
     import pdb
     import traceback
 
-    from .trial import outputs_of
+    from .outputs import outputs_of
 
     class Debugger(pdb.Pdb):
         """Knows whether somebody left it, which `runcall` does not tell."""

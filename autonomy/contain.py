@@ -34,7 +34,6 @@ class Watch:
         self._now: tuple[int, float] | None = None  # a new object for each step
         self._raised = False
         self._thread: threading.Thread | None = None
-        self._ident = 0
 
     def begin(self, limit_s: float) -> None:
         """Note that a step begins in this thread, and how much CPU time it may use."""

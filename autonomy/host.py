@@ -28,8 +28,8 @@ from rtdb.json_object import json_schema
 from .contain import HANG_CPU_S, HANG_WALL_S, StepHung, Watch, capped
 from .loading import check_inputs, checked_params, inputs_of, make_module
 from .module import InputPort, Module, ModuleError, OutputPort, Ranges
+from .outputs import check_names, checks_of, payloads_of
 from .pointer import Link, Unusable, link
-from .ranges import sound, what_is_wrong
 from .shown import shown
 from .wiring import Wire, wire_of
 
@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 HISTORY_S = 2.0
 CONFIG_BYTES, SHOW_BYTES = 2000, 2000
 REASON_BYTES = 160  # as ModuleStatus has it
-OWN_FILES = Path(__file__).parent, ("host.py", "module.py")  # their lines tell a student nothing
+OWN_FILES = Path(__file__).parent, ("host.py", "module.py", "outputs.py")  # their lines tell a student nothing
 FOREVER_NS = 1 << 62
 NOT_YET = "is not there yet"
 JSON_EDGES = 3  # so many of its writer's edges old may a JSON input be that has no max_age_s
@@ -84,10 +84,10 @@ class Host:
         self._store, self._real = store, participant and store.clock.kind is Kind.REAL
         edge: dict[str, Any] = {"every": wire.every, "history_s": HISTORY_S}
         edge["phase"] = (wire.phase + 1 + wire.latency_cycles) % wire.every
-        self._outputs: list[tuple[str, OutputPort[Any], Writer[Any], Callable[[Any], bool]]] = [
-            (name, port, self._insert(name, port, edge), sound(port.cls, port.ranges))
-            for name, port in cls.outputs.items()
+        self._outputs: list[tuple[OutputPort[Any], Writer[Any]]] = [
+            (port, self._insert(name, port, edge)) for name, port in cls.outputs.items()
         ]
+        self._checks = checks_of(cls)
         edge["phase"] = (wire.phase + 1) % wire.every
         self._status = self.component.insert("status", ModuleStatus, **edge)
         few: dict[str, Any] = {"history_s": 0.1}
@@ -211,7 +211,7 @@ class Host:
         try:
             if len(module.__dict__) != names:
                 check_names(module)
-            payloads = self._payloads()
+            payloads = payloads_of(module, self._checks)
         except Exception as error:  # a value may be anything
             self._fail(error, before)
             return
@@ -295,24 +295,6 @@ class Host:
         self.module.__dict__[name] = value
         return ""
 
-    def _payloads(self) -> list[bytes]:
-        """Give the payload of each output, or raise what is wrong with them."""
-        module, payloads = self.module, []
-        for name, port, writer, is_sound in self._outputs:
-            value = module._out.get(port)
-            if value is None:
-                raise ModuleError(f"output {name} was not assigned in this step")
-            if type(value) is not port.cls:
-                raise ModuleError(f"output {name} is a {port.cls.__name__}, got {value!r:.60}")
-            try:
-                fits = is_sound(value)
-            except TypeError:  # a field holds something else than its number
-                fits = False
-            if not fits:
-                raise ModuleError(f"output {name} {what_is_wrong(value, port.ranges)}")
-            payloads.append(writer.schema.pack(value))
-        return payloads
-
     def _result(self, payloads: list[bytes]) -> Result:
         t_data_ns, causes = self._now_ns, []
         for name, port, found, _ in self._inputs:
@@ -325,7 +307,7 @@ class Host:
 
     def _commit(self, result: Result) -> None:
         core = self._store.core
-        for (_, _, writer, _), payload in zip(self._outputs, result.payloads, strict=True):
+        for (_, writer), payload in zip(self._outputs, result.payloads, strict=True):
             core.write(writer.handle, payload, core.not_before(writer.handle, result.t_data_ns), result.causes)
 
     # -- what goes wrong --------------------------------------------------------------------------------------------
@@ -368,11 +350,11 @@ class Host:
 
     def _miss(self, now_ns: int) -> None:
         """Hold the outputs for a while, then write the safe ones."""
-        if not self._outputs or not self._outputs[0][2].head:
+        if not self._outputs or not self._outputs[0][1].head:
             return  # nothing was ever said: there is nothing to take back
         self._missed += 1
         core = self._store.core
-        for _, port, writer, _ in self._outputs:
+        for port, writer in self._outputs:
             if self._missed > port.hold_steps:
                 writer.write(port.safe, core.not_before(writer.handle, now_ns))
 
@@ -432,16 +414,6 @@ class Host:
 def cut(text: str, n_bytes: int) -> str:
     """Cut a text so that it fits."""
     return text.replace("\0", "").encode(errors="replace")[:n_bytes].decode(errors="ignore")
-
-
-def check_names(module: Module) -> None:
-    """Refuse a record under a name that is no port: an output with a spelling mistake."""
-    for name, value in module.__dict__.items():
-        if isinstance(value, Record) and name not in module.inputs and not name.startswith("_"):
-            raise ModuleError(
-                f"self.{name} is not an output; {type(module).__name__} declares "
-                f"{', '.join(module.outputs)} (start names of your own records with _)"
-            )
 
 
 def narrowed(cls: type[Record], ranges: Ranges) -> Any:

@@ -7,11 +7,11 @@ assert outputs["drive"].speed_mps > 0.0
 
 from typing import Any
 
-from rtdb import Sample, schema_of
+from rtdb import Sample
 
-from .host import check_names, seeded
+from .host import seeded
 from .module import Module, ModuleError
-from .ranges import sound, what_is_wrong
+from .outputs import outputs_of
 
 
 def trial(module: Module, *, t_s: float = 0.0, dt_s: float = 0.04, seed: int = 0, **inputs: Any) -> dict[str, Any]:
@@ -47,20 +47,3 @@ def checked_step(module: Module) -> dict[str, Any]:
     module._out.clear()
     module.step()
     return outputs_of(module)
-
-
-def outputs_of(module: Module) -> dict[str, Any]:
-    """Give the outputs of a step; ModuleError says what is wrong with them."""
-    check_names(module)
-    outputs = {}
-    for name, port in type(module).outputs.items():
-        value = module._out.get(port)
-        if value is None:
-            raise ModuleError(f"output {name} was not assigned in this step")
-        if type(value) is not port.cls:
-            raise ModuleError(f"output {name} is a {port.cls.__name__}, got {value!r:.60}")
-        if not sound(port.cls, port.ranges)(value):
-            raise ModuleError(f"output {name} {what_is_wrong(value, port.ranges)}")
-        schema_of(port.cls).pack(value)
-        outputs[name] = value
-    return outputs

@@ -303,3 +303,7 @@ def test_trial_says_what_is_wrong(mine: Any) -> None:
         trial(module, pose=Pose(x_m=1.9))
     with pytest.raises(ModuleError, match="output drive is not finite"):
         trial(mine(), pose=Pose(x_m=math.nan))
+    module = mine()
+    module.gain = "fast"
+    with pytest.raises(ModuleError, match=r"output drive speed_mps is a number \[m/s\], got 'fast'"):
+        trial(module, pose=Pose(x_m=1))
