@@ -162,7 +162,6 @@ class CartEnv(gymnasium.Env[Observation, Action]):
 
     def close(self) -> None:
         """Give everything back."""
-        self._stop_recording()
         self.forget()
         if self._world is not None:
             self._world.close()
@@ -192,6 +191,7 @@ class CartEnv(gymnasium.Env[Observation, Action]):
             self._warm.popitem(last=False)[1].drive.close()
         if self._recording and self._drive is not None:
             self._drive.close()
+        self._drive = None  # it is closed, or its world is another's from here on
         drive = Drive(self.setup_of(seed, self.stack, self._recording))
         if self._recording:
             self._start_recording(drive)
@@ -278,7 +278,8 @@ class CartEnv(gymnasium.Env[Observation, Action]):
         }
 
     def forget(self) -> None:
-        """Close the drives of all episodes; `reset` makes new ones."""
+        """Close the drives of all episodes, and the recording of one under way; `reset` makes new ones."""
+        self._stop_recording()
         drives = {id(image.drive): image.drive for image in self._warm.values()}
         if self._drive is not None:
             drives[id(self._drive)] = self._drive
@@ -328,7 +329,7 @@ def run_module(
     cart = env.unwrapped
     assert isinstance(cart, CartEnv)
     recording = Path(recording)
-    cart.reset(seed=seed)  # the world is that of this seed, and nobody else's episode is under way
+    cart.forget()  # there is one world: this drive takes it from their episodes
     setup = replace(
         cart.setup_of(seed, cart.stack.use(cart.agent, module), True), placement=placement, faults=recording.parent
     )
@@ -337,7 +338,6 @@ def run_module(
             assert drive.agent is not None
             drive.agent.finish()
         fault = drive.agent.fault if drive.agent is not None else ""
-    cart.forget()
     if fault:
         raise ModuleError(f"{cart.agent} = {module} broke: {fault}; the recording up to the end is in {recording}")
     return Recording(recording).trace_hash()

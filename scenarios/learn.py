@@ -161,7 +161,7 @@ def _stepped(env: gymnasium.Env[Any, Any], act: Act, seed: int) -> Iterator[_Jud
 
 def _driven(cart: CartEnv, module: str, seed: int) -> Iterator[_Judged]:
     """Drive with a module, and a referee beside it."""
-    cart.reset(seed=seed)  # the world is that of this seed, and nobody else's episode is under way
+    cart.forget()  # there is one world: this drive takes it from their episodes
     with Drive(cart.setup_of(seed, cart.stack.use(cart.agent, module))) as drive:
         assert drive.agent is not None
         over, end = go_on(drive), End.NONE
@@ -172,7 +172,6 @@ def _driven(cart: CartEnv, module: str, seed: int) -> Iterator[_Judged]:
             steering, pose = _given(drive)
             reward, end = referee.judge(cart.dt_s, steering, pose if cart.agent == "localise" else None)
             yield _Judged(reward.total, referee.aside_m, referee.arrived, str(end), drive.time_s)
-    cart.forget()
 
 
 def _given(drive: Drive) -> tuple[float, Pose | None]:

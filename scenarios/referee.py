@@ -57,20 +57,20 @@ class Referee:
 
     def __init__(self, sim: SimCart, site: SiteRecord, course: Course, off_course_m: float) -> None:
         self._sim, self._envelope, self._off_course_m = sim, Envelope(), off_course_m
-        self._line = self.line = Line(site, course)
+        self.line = Line(site, course)
         params = sim.setup.params
         self._rollover_mps2 = GRAVITY_MPS2 * params.track_m / (2.0 * params.cg_height_m)
         self._boundary = sim.setup.site.boundary_m
         self._accel_mps2 = 0.0
         self._steering = 0.0
         self.arrived = False
-        stations = self._line.stations  # who has a wrong pose stops a little before the end, or beyond it
+        stations = self.line.stations  # who has a wrong pose stops a little before the end, or beyond it
         near_m = stations[-1].s_m - course.radius_m[-1] if stations else 0.0
         self._arrival = sum(station.s_m < near_m for station in stations)
         s = sim.plant.state
-        self._line.move(s.x_m, s.y_m)
-        self._along_m = self._line.along(s.x_m, s.y_m)
-        self.aside_m, self.heading_rad, _ = self._line.aside(s.x_m, s.y_m, s.yaw_rad)
+        self.line.move(s.x_m, s.y_m)
+        self._along_m = self.line.along(s.x_m, s.y_m)
+        self.aside_m, self.heading_rad, _ = self.line.aside(s.x_m, s.y_m, s.yaw_rad)
 
     def judge(self, dt_s: float, steering: float, pose: Pose | None) -> tuple[Reward, End]:
         """Give the reward of the step that is over, and whether the episode has to end.
@@ -78,12 +78,12 @@ class Referee:
         steering: the steering action; pose: the estimate to be judged, None where that is not the task.
         """
         s = self._sim.plant.state
-        self._line.move(s.x_m, s.y_m)
-        before_m, self._along_m = self._along_m, self._line.along(s.x_m, s.y_m)
-        self.aside_m, self.heading_rad, _ = self._line.aside(s.x_m, s.y_m, s.yaw_rad)
+        self.line.move(s.x_m, s.y_m)
+        before_m, self._along_m = self._along_m, self.line.along(s.x_m, s.y_m)
+        self.aside_m, self.heading_rad, _ = self.line.aside(s.x_m, s.y_m, s.yaw_rad)
         end = self._end()
         jerk = min(abs(s.ax_mps2 - self._accel_mps2) / dt_s, 10.0)
-        arrived = self._line.at >= self._arrival and not self.arrived
+        arrived = self.line.at >= self._arrival and not self.arrived
         terms = (
             self._along_m - before_m,
             -0.5 * dt_s * min(abs(self.aside_m), 3.0),

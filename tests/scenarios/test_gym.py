@@ -24,15 +24,6 @@ from scenarios.scenario import load_scenario
 
 NAMED = [name for name in IDS if name != "Fairway/Scenario-v0"]
 REASON = "the extra 'learn' is not installed: stable-baselines3, torch, jupytext"
-STRAIGHT = """\
-id: test/straight
-about: Straight on, and over.
-site: pad
-gps: {grade: rtk_fixed}
-course: {speed_mps: 3.0, waypoints: [{east_m: 15, north_m: 0, radius_m: 1}]}
-duration_s: 12
-criteria: {waypoints_missed: "== 0"}
-"""
 WALL = """\
 id: test/wall
 about: A wall across the way.
@@ -42,13 +33,6 @@ obstacles: [{kind: wall, east_m: 12, north_m: 0, yaw_deg: 90}]
 duration_s: 30
 criteria: {waypoints_missed: "== 0"}
 """
-
-
-@pytest.fixture
-def straight(tmp_path: Path) -> str:
-    path = tmp_path / "straight.scenario.yaml"
-    path.write_text(STRAIGHT)
-    return str(path)
 
 
 @pytest.fixture
@@ -176,6 +160,35 @@ def test_episode_with_a_module_is_the_scenario_with_it_in_the_stack(
     theirs = Recording(tmp_path / "drive.mcap")
     assert theirs.last_cycle > 400
     assert mine == theirs.trace_hash()
+
+
+def test_module_leaves_no_recording_but_its_own_and_ends_the_episode_under_way(straight: str, tmp_path: Path) -> None:
+    env = CartEnv(straight, record=str(tmp_path / "episodes"))
+    env.reset(seed=1)
+    env.step(np.zeros(2))
+    run_module(env, "autonomy.follow:Follow", 7, tmp_path / "module.mcap")
+    assert [path.stem for path in (tmp_path / "episodes").iterdir()] == ["test-straight-1-1"]
+    assert Recording(env.recording).last_cycle > 0
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2))
+    env.close()
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_reset_that_fails_leaves_no_episode(
+    recorded: bool, straight: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = CartEnv(straight, seeds=1, record=str(tmp_path) if recorded else None)
+    env.reset(seed=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(env, "setup_of", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            env.reset(seed=2)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2))
+    env.reset(seed=2)
+    env.step(np.zeros(2))
+    env.close()
 
 
 @pytest.mark.parametrize("level", ["direct", "wire"])

@@ -22,22 +22,6 @@ from scenarios.scenario import load_scenario
 REASON = "the extra 'learn' is not installed: stable-baselines3, torch, jupytext"
 SCENARIO = "scenarios.gym:Fairway/Scenario-v0"
 N_FOLLOW = sum(f.size for f in SEATS["follow"].sees)
-STRAIGHT = """\
-id: test/straight
-about: Straight on, and over.
-site: pad
-gps: {grade: rtk_fixed}
-course: {speed_mps: 3.0, waypoints: [{east_m: 15, north_m: 0, radius_m: 1}]}
-duration_s: 12
-criteria: {waypoints_missed: "== 0"}
-"""
-
-
-@pytest.fixture
-def straight(tmp_path: Path) -> str:
-    path = tmp_path / "straight.scenario.yaml"
-    path.write_text(STRAIGHT)
-    return str(path)
 
 
 def rule() -> Network:

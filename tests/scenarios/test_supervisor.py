@@ -58,10 +58,18 @@ def live(tmp_path: Path) -> Iterator[Callable[..., LiveRun]]:
         run.close()
 
 
-def end_of(run: LiveRun) -> tuple[float, float]:
-    """How fast the cart was at most, and at the end, in truth."""
+def it_drove_and_stands(run: LiveRun, faster_than_mps: float = 1.0) -> None:
+    """In truth, the cart was faster than that, and stands at the end of the recording."""
     truth = [row.value.speed_mps for row in Recording(run.recording).read("world/cart", CartTruth)]
-    return max(truth), abs(truth[-1])
+    assert max(truth) > faster_than_mps
+    assert abs(truth[-1]) < 0.01
+
+
+def ends_well(run: LiveRun) -> None:
+    """The cart drove and stands, and nothing of the run is left."""
+    it_drove_and_stands(run)
+    run.until_all_are_gone()
+    assert run.left_behind() == []
 
 
 # -- decisions ----------------------------------------------------------------------------------------------------
@@ -118,9 +126,7 @@ def test_a_drive_arrives_in_real_time_restarts_who_is_not_needed_and_leaves_noth
     assert "is started anew" in run.printed
     result = json.loads(run.recording.with_name("result.json").read_text())
     assert (result["verdict"], result["metrics"]["waypoints_missed"]) == ("PASS", 0)
-    assert end_of(run)[1] < 0.01
-    run.until_all_are_gone()
-    assert run.left_behind() == []
+    ends_well(run)
 
 
 @pytest.mark.proof
@@ -134,11 +140,7 @@ def test_without_a_required_module_the_limits_stop_the_cart_and_it_is_not_restar
     result = json.loads(run.recording.with_name("result.json").read_text())
     assert result["verdict"] == "ERROR"
     assert "follow ended in cycle" in result["reason"]
-    fastest, last = end_of(run)
-    assert fastest > 1.0
-    assert last < 0.01
-    run.until_all_are_gone()
-    assert run.left_behind() == []
+    ends_well(run)
 
 
 @pytest.mark.proof
@@ -149,9 +151,7 @@ def test_without_the_supervisor_hal_stops_the_cart_and_all_processes_end(live):
     run.until_all_are_gone()
     assert "hal: stopping the cart: the supervisor is gone" in run.printed
     assert "hal: the cart stands: the supervisor is gone" in run.printed
-    fastest, last = end_of(run)
-    assert fastest > 1.0
-    assert last < 0.01
+    it_drove_and_stands(run)
 
 
 @pytest.mark.proof
@@ -162,11 +162,7 @@ def test_without_the_clock_hal_stops_the_cart_on_its_own_time(live):
     assert run.ended() == 3, run.printed
     assert "hal: the cart stands: the clock is gone" in run.printed
     assert "clock ended in cycle" in run.printed
-    fastest, last = end_of(run)
-    assert fastest > 1.0
-    assert last < 0.01
-    run.until_all_are_gone()
-    assert run.left_behind() == []
+    ends_well(run)
 
 
 @pytest.mark.proof
@@ -178,11 +174,7 @@ def test_who_ends_the_run_stops_the_cart_first(live):
     assert run.ended() == 130, run.printed
     assert "SIGTERM came, the cart was stopped; the recording up to there is in " in run.printed
     assert "Traceback" not in run.printed
-    fastest, last = end_of(run)
-    assert fastest > 1.0
-    assert last < 0.01
-    run.until_all_are_gone()
-    assert run.left_behind() == []
+    ends_well(run)
 
 
 @pytest.mark.proof
@@ -196,7 +188,5 @@ def test_required_module_that_hangs_is_named_and_the_cart_stands(live, tmp_path)
     result = json.loads(run.recording.with_name("result.json").read_text())
     assert result["verdict"] == "ERROR"
     assert "follow hangs: the last cycle that it finished is" in result["reason"]
-    fastest, last = end_of(run)
-    assert fastest > 0.5
-    assert last < 0.01
+    it_drove_and_stands(run, faster_than_mps=0.5)
     run.until_all_are_gone()
