@@ -49,6 +49,18 @@ class JsonSchema(Schema):
             raise RecordError(f"not JSON: byte {error.start} is not UTF-8") from error
 
 
+def json_payload(data: bytes, size: int) -> bytes:
+    """Give the payload of a JSON object whose text somebody wrote, as it was written."""
+    try:
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        raise RecordError(f"not JSON: byte {error.start} is not UTF-8") from error
+    _check(loads(text), "", 0)
+    if len(data) > size:
+        raise RecordError(f"this JSON takes {len(data)} bytes, the object has {size}; say less, or give it more room")
+    return data.ljust(size, b"\0")
+
+
 @functools.cache
 def json_schema(n_bytes: int) -> JsonSchema:
     """Give the schema of a JSON object of at most n bytes."""

@@ -1,0 +1,176 @@
+"""Contents of files as objects of the store: any number of bytes, a revision per write, seen through cuts.
+
+An object has slots of one size, a file grows. So a file's content is a row of objects, `files/1`, `files/2`, ...: what
+a cut shows is that of the youngest that shows anything. An older one goes when the one behind it is seen.
+"""
+
+import contextlib
+import functools
+import struct
+from collections.abc import Callable
+
+from ..components import Component
+from ..errors import Deleted, ObjectMissing, TooFast
+from ..layout import Field, Spec
+from ..objects import HOST_DEPENDENT, Writer
+from ..records import Record, Schema
+from ..store import Store
+from .pace import Pace
+
+RING_BYTES = 32 << 10  # of a file's slots, as long as that is enough for a few
+LEAST_SLOTS, MOST_SLOTS = 6, 100
+LEAST_BYTES = 256
+KEPT = 8192  # handles that are not looked through for deleted objects
+_COUNT = struct.Struct("<I")
+
+
+@functools.cache
+def schema_for(n_bytes: int) -> Schema:
+    """Give the schema of contents of at most n bytes."""
+    return Schema("File", "A revision of a file.", [Field("data", Spec("u8", "", "its content", n_bytes, "seq"), 1)])
+
+
+def room_for(n_bytes: int) -> int:
+    """Give the size of the slots in which a content goes: the next power of two."""
+    return max(LEAST_BYTES, 1 << (n_bytes - 1).bit_length()) if n_bytes else LEAST_BYTES
+
+
+def slots_for(room: int) -> int:
+    """Give how many revisions a file's ring holds."""
+    return min(MOST_SLOTS, max(LEAST_SLOTS, RING_BYTES // (room + 64)))
+
+
+class Content:
+    """What one file holds. Revisions are written to the store at once; each shows from the next edge on."""
+
+    __slots__ = ("_files", "_seen", "held", "newest", "numbers", "rooms")
+
+    def __init__(self, files: "Contents", numbers: list[int] | None = None) -> None:
+        self._files = files
+        self.numbers: list[int] = numbers or []  # of its objects, oldest first
+        self.rooms = [files.store.core.object(files.handle(k))[4] - _COUNT.size for k in self.numbers]
+        self._seen: tuple[int, int, bytes, int] = (0, 0, b"", 0)  # the revision that was looked at last
+        self.newest = b""  # the newest revision, whether it shows already or not
+        self.held = False  # it is not in the store yet: there were more revisions in this cycle than a ring holds
+
+    def write(self, data: bytes) -> None:
+        """Write a revision. StoreFull where there is no room; the one before stands then."""
+        if not self.numbers or len(data) > self.rooms[-1]:
+            self._grow(len(data))
+        self.newest = data
+        self.held = not self._written(data)
+        if self.held:
+            self._files.busy.add(self)
+
+    def _grow(self, n_bytes: int) -> None:
+        room = room_for(n_bytes)
+        self.numbers.append(self._files.insert(room))
+        self.rooms.append(room)
+        self._files.busy.add(self)
+
+    def _written(self, data: bytes) -> bool:
+        core, handle = self._files.store.core, self._files.handle(self.numbers[-1])
+        payload = _COUNT.pack(len(data)) + data.ljust(self.rooms[-1], b"\0")
+        try:
+            core.write(handle, payload, core.not_before(handle, core.now_ns), ())
+        except TooFast:
+            return False
+        return True
+
+    def read(self, cycle: int) -> tuple[bytes, int]:
+        """Give what a cut shows, and the time of its writing; empty and 0 before the first revision."""
+        core = self._files.store.core
+        for number in reversed(self.numbers):
+            try:
+                handle = self._files.handle(number)
+                write = core.visible_write(handle, cycle)
+                if write and (number, write) != self._seen[:2]:
+                    raw = core.read(handle, write)
+                    (count,) = _COUNT.unpack_from(raw[0])
+                    self._seen = number, write, raw[0][_COUNT.size : _COUNT.size + count], raw[2]
+            except (Deleted, ObjectMissing):
+                continue
+            if write:
+                return self._seen[2:]
+        return b"", 0
+
+    def edge(self, cycle: int) -> bool:
+        """Write what is held, and drop objects that have been followed by a larger one; False when all is done."""
+        if self.held:
+            self.held = not self._written(self.newest)
+        core = self._files.store.core
+        while len(self.numbers) > 1 and core.visible_write(self._files.handle(self.numbers[1]), cycle):
+            self._files.delete(self.numbers.pop(0))
+            self.rooms.pop(0)
+        return self.held or len(self.numbers) > 1
+
+    def drop(self) -> None:
+        """Delete the file's objects; what they held stays readable for a while, for `/at`."""
+        for number in self.numbers:
+            self._files.delete(number)
+        self.numbers.clear()
+        self.rooms.clear()
+        self.held = False
+
+
+class Contents:
+    """The objects that hold contents, all of one component; numbered, and never again under the same number."""
+
+    def __init__(
+        self, store: Store, component: Component, pace: Pace, prefix: str, changed: Callable[[int], None]
+    ) -> None:
+        self.store, self._component, self._pace, self._prefix = store, component, pace, f"{component.name}/{prefix}"
+        self._changed = changed  # called with the version of the directory before each change
+        self.busy: set[Content] = set()  # those for which the next edge has work
+        self._handles = {int(o.name[len(self._prefix) :]): o.handle for o in store.objects(f"{self._prefix}[0-9]*")}
+        self.last = max(self._handles, default=0)
+
+    def handle(self, number: int) -> int:
+        """Give the handle of an object, of a deleted one too as long as its history may be there."""
+        handle = self._handles.get(number)
+        if handle is None:
+            raise ObjectMissing(f"{self._prefix}{number} is not kept any more")
+        return handle
+
+    def insert(self, room: int) -> int:
+        """Insert an object; returns its number."""
+        number, period_s, before = self.last + 1, self._pace.every * self.store.tick_ns * 1e-9, self.store.core.version
+        writer: Writer[Record] = self._component.insert(
+            f"{self._prefix.partition('/')[2]}{number}",
+            schema_for(room),
+            every=self._pace.every,
+            phase=self._pace.phase,
+            history_s=slots_for(room) * period_s,
+            budget_bytes=slots_for(room) * (room + 128),
+            flags=HOST_DEPENDENT,
+        )
+        self.last, self._handles[number] = number, writer.handle
+        self._changed(before)
+        return number
+
+    def delete(self, number: int) -> None:
+        """Delete an object; its history stays for a while."""
+        before = self.store.core.version
+        with contextlib.suppress(Deleted, ObjectMissing):
+            self.store.core.delete(self.handle(number))
+            self._changed(before)
+        for old in list(self._handles)[:-KEPT]:  # what is that old is gone from the store, too
+            with contextlib.suppress(Deleted):
+                self.store.core.object(self._handles[old])
+                continue
+            del self._handles[old]
+
+    def edge(self, cycle: int) -> None:
+        """Do what waited for an edge."""
+        for content in list(self.busy):
+            if not content.edge(cycle):
+                self.busy.discard(content)
+
+    def fits(self, n_bytes: int) -> bool:
+        """Say whether a first revision of that size would find room."""
+        room = room_for(n_bytes)
+        return slots_for(room) * (room + 128) < self.store.memory[1]
+
+    def numbers(self) -> list[int]:
+        """Give the numbers of the objects that are there."""
+        return list(self._handles)

@@ -1,0 +1,324 @@
+"""The server: sessions on sockets, in one asyncio loop. A thread tells it the edges of the store.
+
+A client that reads slowly is not listened to until it has taken what was sent; one that is dead costs its buffers.
+Neither delays an edge: replies go into the sockets' buffers, and the store's clock is not ours.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, cast
+
+from ..clock import Kind
+from ..store import Store
+from .addresses import Address
+from .errors import FsError
+from .pace import Pace
+from .policy import Limits, Tokens
+from .seats import SeatSpec
+from .session import Session
+from .tree import Tree
+from .waiting import Waiting
+
+log = logging.getLogger(__name__)
+LOOK_S = 0.25  # between looks at what stands still
+BINS = 20  # bin k counts from 2^k us
+_CREDENTIALS = struct.Struct("3i")
+
+
+class FileServer:
+    """Serves a named store as files. Use `run`, or `start` and `close` inside a loop."""
+
+    def __init__(
+        self,
+        db: str,
+        *,
+        pace: Pace | None = None,
+        seats: Iterable[SeatSpec] = (),
+        tokens: Tokens | None = None,
+        limits: Limits | None = None,
+        trace: Callable[[str], None] | None = None,
+        grace_s: float = 1.0,
+        patience_s: float = 5.0,
+    ) -> None:
+        self.store = Store.attach(db)
+        try:
+            self.tree = Tree(self.store, pace=pace, seats=seats, limits=limits, patience_s=patience_s)
+        except BaseException:
+            self.store.close()
+            raise
+        self.tree.report = self.report
+        self.tokens, self.waiting, self.trace = tokens or Tokens(), Waiting(), trace
+        self._grace_s = grace_s
+        self.connections: set[Connection] = set()
+        self._servers: list[asyncio.AbstractServer] = []
+        self._paths: list[Address] = []
+        self._cycle = self.store.cycle
+        self._edge_s = time.monotonic()
+        self._stop = threading.Event()
+        self._watch: threading.Thread | None = None
+        self._told = False  # an edge is on its way to the loop
+        self._real = self.store.clock.kind is Kind.REAL
+        self._lateness_us = [0] * BINS
+        self._answer_us = [0] * BINS
+        self._edges = self._skipped = self._requests = 0
+        self._look: asyncio.TimerHandle | None = None
+
+    # -- beginning and end ----------------------------------------------------------------------------------------
+
+    async def start(self, addresses: Iterable[Address], *, anywhere: bool = False) -> list[Address]:
+        """Listen; returns the addresses with their real ports. anywhere: others than this machine may come."""
+        self._loop = asyncio.get_running_loop()
+        bound = [await self._listen(address, anywhere) for address in addresses]
+        self._watch = threading.Thread(target=self._watch_edges, name="edges", daemon=True)
+        self._watch.start()
+        self._look_around()
+        return bound
+
+    async def _listen(self, address: Address, anywhere: bool) -> Address:
+        if not address.is_local and not anywhere:
+            raise FsError(1, f"{address} can be reached from other machines; say --anywhere if that is meant")
+        if address.path is not None:
+            _clear(address)
+            before = os.umask(0o177)
+            try:
+                server: asyncio.AbstractServer = await self._loop.create_unix_server(
+                    lambda: Connection(self, unix=True), str(address.path), backlog=512
+                )
+            finally:
+                os.umask(before)
+            self._paths.append(address)
+        else:
+            server = await self._loop.create_server(
+                lambda: Connection(self, unix=False), address.host, address.port, backlog=512
+            )
+            address = Address(host=address.host, port=server.sockets[0].getsockname()[1])
+        self._servers.append(server)
+        return address
+
+    async def close(self) -> None:
+        """End all connections, and leave the store."""
+        self._stop.set()
+        if self._look is not None:
+            self._look.cancel()
+        for server in self._servers:
+            server.close()
+        for connection in list(self.connections):
+            connection.close()
+        for address in self._paths:
+            with contextlib.suppress(OSError):
+                os.unlink(str(address.path))
+        if self._watch is not None:
+            self._watch.join()
+        self.tree.close()
+        self.store.close()
+
+    # -- edges ----------------------------------------------------------------------------------------------------
+
+    def _watch_edges(self) -> None:
+        assert self.store.name is not None
+        with Store.attach(self.store.name) as store:
+            cycle = self._cycle
+            while not self._stop.is_set():
+                now = store.wait_cycle(cycle, 0.2)
+                if now is None:
+                    continue
+                cycle = now
+                if not self._told:
+                    self._told = True
+                    with contextlib.suppress(RuntimeError):  # the loop has ended
+                        self._loop.call_soon_threadsafe(self._edge)
+
+    def _edge(self) -> None:
+        """A cycle has begun: answer who waits for it, then do what can wait."""
+        self._told = False
+        if self._stop.is_set():
+            return
+        cycle = self.store.cycle
+        if cycle == self._cycle:
+            return
+        self._edges, self._skipped = self._edges + 1, self._skipped + cycle - self._cycle - 1
+        self._cycle, self._edge_s = cycle, time.monotonic()
+        edge_ns = self.store.t0_ns + cycle * self.store.tick_ns
+        waited = len(self.waiting)
+        if self._real:
+            _count(self._lateness_us, self.store.now_ns - edge_ns)
+        self.waiting.edge(cycle)
+        if self._real and len(self.waiting) < waited:
+            _count(self._answer_us, self.store.now_ns - edge_ns)
+        self.tree.edge(cycle)
+        for connection in self.connections:
+            connection.session.edge()
+
+    def _look_around(self) -> None:
+        """Look at what stands still, by the host's clock."""
+        now_s = time.monotonic()
+        if now_s - self._edge_s > self._grace_s and len(self.waiting):
+            self.waiting.stopped(self.store.cycle, now_s - self._grace_s, clock_alive=self.store.clock.alive)
+        for seat in self.tree.seats.values():
+            seat.idle(now_s)
+        self._look = self._loop.call_later(LOOK_S, self._look_around)
+
+    # -- what is seen of it ---------------------------------------------------------------------------------------
+
+    def report(self) -> dict[str, Any]:
+        """Say how the server does: how late it heard of edges, and had answered all who waited for them."""
+        return {
+            "pid": os.getpid(),
+            "connections": len(self.connections),
+            "requests": self._requests + sum(c.session.requests for c in self.connections),
+            "waiting": len(self.waiting),
+            "edges": self._edges,
+            "edges_skipped": self._skipped,
+            "heard_us": self._lateness_us,
+            "answered_us": self._answer_us,
+            "missed": {name: seat.missed for name, seat in self.tree.seats.items()},
+            "refused": {name: seat.refused for name, seat in self.tree.seats.items() if seat.refused},
+        }
+
+    def ended(self, connection: "Connection") -> None:
+        """A connection is over."""
+        self.connections.discard(connection)
+        self._requests += connection.session.requests
+
+
+class Connection(asyncio.Protocol):
+    """One connection: moves bytes between a socket and a session."""
+
+    def __init__(self, server: FileServer, *, unix: bool) -> None:
+        self._server, self._unix = server, unix
+        self._transport: asyncio.Transport | None = None
+        self._quick: Callable[[int, int, int], None] | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Set the socket up, or close it at once where there is no place for it."""
+        transport = cast("asyncio.Transport", transport)  # uvloop's is none
+        server, sock = self._server, transport.get_extra_info("socket")
+        self._transport = transport
+        self.session = Session(server.tree, server.waiting, server.tokens, transport.write, trace=server.trace)
+        if self._unix and not _is_friend(sock):
+            log.warning("a connection of another user is closed")
+            transport.abort()
+            return
+        if len(server.connections) >= server.tree.limits.connections:
+            log.warning("a connection is closed: there are %d", len(server.connections))
+            transport.abort()
+            return
+        server.connections.add(self)
+        transport.set_write_buffer_limits(high=server.tree.limits.unsent_bytes)
+        if not self._unix:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            for option, value in ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3)):
+                sock.setsockopt(socket.IPPROTO_TCP, option, value)
+            self._quick = sock.setsockopt
+
+    def data_received(self, data: bytes) -> None:
+        """Answer what came. Linux' client has no TCP_NODELAY: without quick acknowledgement its next request waits."""
+        if self._quick is not None:
+            self._quick(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        self.session.feed(data)
+        if self.session.over:
+            self.close()
+
+    def pause_writing(self) -> None:
+        """The client does not take its replies."""
+        self.session.paused = True
+        assert self._transport is not None
+        self._transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        """It does again."""
+        self.session.paused = False
+        assert self._transport is not None
+        self._transport.resume_reading()
+        self.session.go_on()
+        if self.session.over:
+            self.close()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Everything that the connection held goes."""
+        if self in self._server.connections:
+            self._server.ended(self)
+        self.session.close()
+
+    def close(self) -> None:
+        """End it."""
+        if self._transport is not None:
+            self._transport.close()
+
+
+def _is_friend(sock: socket.socket) -> bool:
+    """Whether the process at the other end belongs to this user, or to root."""
+    _, uid, _ = _CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    return uid in (0, os.getuid())
+
+
+def _clear(address: Address) -> None:
+    """Remove a socket that a dead server left; FsError where a living one listens."""
+    path = str(address.path)
+    if len(path.encode()) > 107:
+        raise FsError(36, f"{path}: a socket's path has at most 107 bytes")
+    if not os.path.lexists(path):
+        return
+    with socket.socket(socket.AF_UNIX) as probe:
+        try:
+            probe.connect(path)
+        except ConnectionRefusedError:
+            os.unlink(path)
+        except OSError as error:
+            raise FsError(error.errno or 5, f"{path}: {error.strerror}") from error
+        else:
+            raise FsError(98, f"{path}: a server listens there already")
+
+
+def _count(bins: list[int], ns: int) -> None:
+    bins[min(BINS - 1, max(0, max(1, ns // 1000).bit_length() - 1))] += 1
+
+
+def new_loop() -> asyncio.AbstractEventLoop:
+    """Make an event loop: uvloop's, if it is installed."""
+    try:
+        import uvloop
+    except ImportError:
+        return asyncio.new_event_loop()
+    loop: asyncio.AbstractEventLoop = uvloop.new_event_loop()
+    return loop
+
+
+def run(
+    server: FileServer,
+    addresses: list[Address],
+    *,
+    anywhere: bool = False,
+    ready: Callable[[list[Address]], None],
+    until: Callable[[], "asyncio.Future[Any]"] | None = None,
+    plain: bool = False,
+) -> None:
+    """Serve until SIGINT or SIGTERM, or until a future is done. plain: without uvloop."""
+    import signal
+
+    sys.setswitchinterval(0.0005)  # the thread that hears the edges must not wait for a slice of 5 ms
+
+    async def serve() -> None:
+        loop = asyncio.get_running_loop()
+        over = asyncio.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, over.set)
+        try:
+            ready(await server.start(addresses, anywhere=anywhere))
+            if until is not None:
+                until().add_done_callback(lambda _: over.set())
+            await over.wait()
+        finally:
+            await server.close()
+
+    with asyncio.Runner(loop_factory=asyncio.new_event_loop if plain else new_loop) as runner:
+        runner.run(serve())
