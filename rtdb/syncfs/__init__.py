@@ -10,7 +10,7 @@ from .pace import Pace
 from .policy import OPERATOR, Limits, Tokens
 from .seats import SeatSpec
 from .server import FileServer, run
-from .tree import Tree
+from .service import Service
 
 __all__ = [
     "OPERATOR",
@@ -21,8 +21,8 @@ __all__ = [
     "Limits",
     "Pace",
     "SeatSpec",
+    "Service",
     "Tokens",
-    "Tree",
     "default_address",
     "run",
 ]

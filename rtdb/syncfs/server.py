@@ -14,61 +14,36 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, cast
 
-from ..clock import Kind
 from ..store import Store
 from .addresses import Address
 from .errors import FsError
-from .pace import Pace
-from .policy import Limits, Tokens
-from .seats import SeatSpec
+from .service import Service
 from .session import Session
-from .tree import Tree
-from .waiting import Waiting
 
 log = logging.getLogger(__name__)
 LOOK_S = 0.25  # between looks at what stands still
-BINS = 20  # bin k counts from 2^k us
 _CREDENTIALS = struct.Struct("3i")
 
 
 class FileServer:
-    """Serves a named store as files. Use `run`, or `start` and `close` inside a loop."""
+    """Serves a named store as files; options are those of Service. Use `run`, or `start` and `close` inside a loop."""
 
-    def __init__(
-        self,
-        db: str,
-        *,
-        pace: Pace | None = None,
-        seats: Iterable[SeatSpec] = (),
-        tokens: Tokens | None = None,
-        limits: Limits | None = None,
-        trace: Callable[[str], None] | None = None,
-        grace_s: float = 1.0,
-        patience_s: float = 5.0,
-    ) -> None:
+    def __init__(self, db: str, **options: Any) -> None:
         self.store = Store.attach(db)
         try:
-            self.tree = Tree(self.store, pace=pace, seats=seats, limits=limits, patience_s=patience_s)
+            self.service = Service(self.store, **options)
         except BaseException:
             self.store.close()
             raise
-        self.tree.report = self.report
-        self.tokens, self.waiting, self.trace = tokens or Tokens(), Waiting(), trace
-        self._grace_s = grace_s
         self.connections: set[Connection] = set()
         self._servers: list[asyncio.AbstractServer] = []
-        self._paths: list[Address] = []
-        self._cycle = self.store.cycle
-        self._edge_s = time.monotonic()
+        self._sockets: list[Path] = []
         self._stop = threading.Event()
         self._watch: threading.Thread | None = None
         self._told = False  # an edge is on its way to the loop
-        self._real = self.store.clock.kind is Kind.REAL
-        self._lateness_us = [0] * BINS
-        self._answer_us = [0] * BINS
-        self._edges = self._skipped = self._requests = 0
         self._look: asyncio.TimerHandle | None = None
 
     # -- beginning and end ----------------------------------------------------------------------------------------
@@ -94,7 +69,7 @@ class FileServer:
                 )
             finally:
                 os.umask(before)
-            self._paths.append(address)
+            self._sockets.append(address.path)
         else:
             server = await self._loop.create_server(
                 lambda: Connection(self, unix=False), address.host, address.port, backlog=512
@@ -112,12 +87,11 @@ class FileServer:
             server.close()
         for connection in list(self.connections):
             connection.close()
-        for address in self._paths:
-            with contextlib.suppress(OSError):
-                os.unlink(str(address.path))
+        for path in self._sockets:
+            path.unlink(missing_ok=True)
         if self._watch is not None:
             self._watch.join()
-        self.tree.close()
+        self.service.close()
         self.store.close()
 
     # -- edges ----------------------------------------------------------------------------------------------------
@@ -125,7 +99,7 @@ class FileServer:
     def _watch_edges(self) -> None:
         assert self.store.name is not None
         with Store.attach(self.store.name) as store:
-            cycle = self._cycle
+            cycle = self.service.cycle
             while not self._stop.is_set():
                 now = store.wait_cycle(cycle, 0.2)
                 if now is None:
@@ -137,56 +111,13 @@ class FileServer:
                         self._loop.call_soon_threadsafe(self._edge)
 
     def _edge(self) -> None:
-        """A cycle has begun: answer who waits for it, then do what can wait."""
         self._told = False
-        if self._stop.is_set():
-            return
-        cycle = self.store.cycle
-        if cycle == self._cycle:
-            return
-        self._edges, self._skipped = self._edges + 1, self._skipped + cycle - self._cycle - 1
-        self._cycle, self._edge_s = cycle, time.monotonic()
-        edge_ns = self.store.t0_ns + cycle * self.store.tick_ns
-        waited = len(self.waiting)
-        if self._real:
-            _count(self._lateness_us, self.store.now_ns - edge_ns)
-        self.waiting.edge(cycle)
-        if self._real and len(self.waiting) < waited:
-            _count(self._answer_us, self.store.now_ns - edge_ns)
-        self.tree.edge(cycle)
-        for connection in self.connections:
-            connection.session.edge()
+        if not self._stop.is_set():
+            self.service.edge(time.monotonic())
 
     def _look_around(self) -> None:
-        """Look at what stands still, by the host's clock."""
-        now_s = time.monotonic()
-        if now_s - self._edge_s > self._grace_s and len(self.waiting):
-            self.waiting.stopped(self.store.cycle, now_s - self._grace_s, clock_alive=self.store.clock.alive)
-        for seat in self.tree.seats.values():
-            seat.idle(now_s)
+        self.service.look(time.monotonic())
         self._look = self._loop.call_later(LOOK_S, self._look_around)
-
-    # -- what is seen of it ---------------------------------------------------------------------------------------
-
-    def report(self) -> dict[str, Any]:
-        """Say how the server does: how late it heard of edges, and had answered all who waited for them."""
-        return {
-            "pid": os.getpid(),
-            "connections": len(self.connections),
-            "requests": self._requests + sum(c.session.requests for c in self.connections),
-            "waiting": len(self.waiting),
-            "edges": self._edges,
-            "edges_skipped": self._skipped,
-            "heard_us": self._lateness_us,
-            "answered_us": self._answer_us,
-            "missed": {name: seat.missed for name, seat in self.tree.seats.items()},
-            "refused": {name: seat.refused for name, seat in self.tree.seats.items() if seat.refused},
-        }
-
-    def ended(self, connection: "Connection") -> None:
-        """A connection is over."""
-        self.connections.discard(connection)
-        self._requests += connection.session.requests
 
 
 class Connection(asyncio.Protocol):
@@ -195,6 +126,7 @@ class Connection(asyncio.Protocol):
     def __init__(self, server: FileServer, *, unix: bool) -> None:
         self._server, self._unix = server, unix
         self._transport: asyncio.Transport | None = None
+        self.session: Session | None = None  # of a connection that is let in
         self._quick: Callable[[int, int, int], None] | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -202,17 +134,18 @@ class Connection(asyncio.Protocol):
         transport = cast("asyncio.Transport", transport)  # uvloop's is none
         server, sock = self._server, transport.get_extra_info("socket")
         self._transport = transport
-        self.session = Session(server.tree, server.waiting, server.tokens, transport.write, trace=server.trace)
+        limits = server.service.tree.limits
         if self._unix and not _is_friend(sock):
             log.warning("a connection of another user is closed")
             transport.abort()
             return
-        if len(server.connections) >= server.tree.limits.connections:
+        if len(server.connections) >= limits.connections:
             log.warning("a connection is closed: there are %d", len(server.connections))
             transport.abort()
             return
         server.connections.add(self)
-        transport.set_write_buffer_limits(high=server.tree.limits.unsent_bytes)
+        self.session = server.service.begin(transport.write)
+        transport.set_write_buffer_limits(high=limits.unsent_bytes)
         if not self._unix:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -224,30 +157,32 @@ class Connection(asyncio.Protocol):
         """Answer what came. Linux' client has no TCP_NODELAY: without quick acknowledgement its next request waits."""
         if self._quick is not None:
             self._quick(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-        self.session.feed(data)
-        if self.session.over:
-            self.close()
+        session = self.session
+        if session is not None:
+            session.feed(data)
+            if session.over:
+                self.close()
 
     def pause_writing(self) -> None:
-        """The client does not take its replies."""
-        self.session.paused = True
-        assert self._transport is not None
-        self._transport.pause_reading()
+        """The client does not take its replies: it is not listened to until it does."""
+        if self.session is not None and self._transport is not None:
+            self.session.paused = True
+            self._transport.pause_reading()
 
     def resume_writing(self) -> None:
-        """It does again."""
-        self.session.paused = False
-        assert self._transport is not None
-        self._transport.resume_reading()
-        self.session.go_on()
-        if self.session.over:
-            self.close()
+        """It takes them again."""
+        if self.session is not None and self._transport is not None:
+            self.session.paused = False
+            self._transport.resume_reading()
+            self.session.go_on()
+            if self.session.over:
+                self.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Everything that the connection held goes."""
-        if self in self._server.connections:
-            self._server.ended(self)
-        self.session.close()
+        self._server.connections.discard(self)
+        if self.session is not None:
+            self._server.service.end(self.session)
 
     def close(self) -> None:
         """End it."""
@@ -277,10 +212,6 @@ def _clear(address: Address) -> None:
             raise FsError(error.errno or 5, f"{path}: {error.strerror}") from error
         else:
             raise FsError(98, f"{path}: a server listens there already")
-
-
-def _count(bins: list[int], ns: int) -> None:
-    bins[min(BINS - 1, max(0, max(1, ns // 1000).bit_length() - 1))] += 1
 
 
 def new_loop() -> asyncio.AbstractEventLoop:
