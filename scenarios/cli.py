@@ -10,6 +10,7 @@ import typer
 
 from autonomy.cli import register as register_modules
 from rtdb.cli import app as db_app
+from rtdb.syncfs.cli import register as register_files
 
 from .cli_regression import register as register_regression
 from .cli_running import register as register_running
@@ -39,6 +40,7 @@ app.add_typer(hal_app, name="hal")
 register_regression(app)
 register_running(app)
 register_modules(app)
+register_files(app)
 
 
 @app.command()
