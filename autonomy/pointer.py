@@ -2,15 +2,17 @@
 
 What does not fit is said when the pointer is resolved, in one line: no such object, another record, another unit, a
 range that the module cannot work with. Objects without a record (JSON) name units in their keys; what they hold is
-checked at each read, and a value that does not fit counts as absent.
+checked at each read, and a value that does not fit counts as absent. A component that writes nothing but a JSON
+`status` (a script, through the file server) says everything there: `follow/drive` is `drive` in its `follow/status`.
 """
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 import msgspec
 
-from rtdb import Object, Record, RecordError, Sample, Schema, Store, schema_of
+from rtdb import Object, ObjectMissing, Record, RecordError, Sample, Schema, Store, schema_of
 from rtdb.json_object import is_json, number_at
 from rtdb.layout import Field, Spec
 
@@ -42,15 +44,15 @@ def split(pointer: str) -> tuple[str, str | None]:
 def link(store: Store, pointer: str, port: InputPort[Any], timeout_s: float = 0.0) -> Link:
     """Resolve a pointer for a port. ModuleError says what does not fit; RtdbError that there is no such object."""
     name, path = split(pointer)
-    if port.cls is float:
-        if path is None:
-            raise ModuleError(f"a number [{port.unit}] is wired to a field: {name}#/FIELD")
-        return _number(store.find(name, timeout_s=timeout_s), path, port)
-    if path is not None:
+    if port.cls is float and path is None:
+        raise ModuleError(f"a number [{port.unit}] is wired to a field: {name}#/FIELD")
+    if port.cls is not float and path is not None:
         raise ModuleError(f"a {port.cls.__name__} is wired to a whole object: {name}")
-    obj = store.find(name, timeout_s=timeout_s)
+    obj, key = resolve(store, name, timeout_s)
+    if path is not None:
+        return _number(obj, f"/{key}{path}" if key else path, port)
     if is_json(obj.stored.fields):
-        return Link(obj, _record_of_json(port.cls, port.ranges), json=True)
+        return Link(obj, _record_of_json(port.cls, port.ranges, key), json=True)
     obj = store.find(name, port.cls)
     _check_ranges(port.cls.__name__, obj.stored, port.ranges)
     if not port.ranges:
@@ -63,6 +65,23 @@ def link(store: Store, pointer: str, port: InputPort[Any], timeout_s: float = 0.
         raise Unusable(what_is_wrong(sample.value, ranges))
 
     return Link(obj, narrowed, json=False)
+
+
+def resolve(store: Store, name: str, timeout_s: float = 0.0) -> tuple[Object[Any], str]:
+    """Find an object by its name: itself, or the JSON status that has it under a key, which is given, too."""
+    component, _, key = name.partition("/")
+    deadline = time.monotonic() + timeout_s
+    while True:
+        version = store.core.version
+        try:
+            return store.find(name), ""
+        except ObjectMissing:
+            status = next(iter(store.objects(f"{component}/status")), None)
+            if status is not None and is_json(status.stored.fields):
+                return status, key
+            left_ns = int((deadline - time.monotonic()) * 1e9)
+            if left_ns <= 0 or store.core.wait_directory(version, left_ns) is None:
+                raise
 
 
 def _check_ranges(what: str, stored: Schema, wanted: Ranges) -> None:
@@ -125,8 +144,11 @@ def field_at(schema: Schema, path: str) -> Spec:
     return found.spec
 
 
-def _record_of_json(cls: type[Record], ranges: Ranges) -> Callable[[Sample[Any]], Record]:
-    """Make the function that reads a record of plain numbers out of a JSON object, by the names of its fields."""
+def _record_of_json(cls: type[Record], ranges: Ranges, key: str) -> Callable[[Sample[Any]], Record]:
+    """Make the function that reads a record of plain numbers out of a JSON object, by the names of its fields.
+
+    key: under which it stands in the object, empty where it is the object.
+    """
     fields = schema_of(cls).fields
     required = {info.name for info in msgspec.structs.fields(cls) if info.required}
     strange = [f.name for f in fields if f.spec.kind in NO_NUMBERS or f.spec.shape != "one"]
@@ -135,12 +157,15 @@ def _record_of_json(cls: type[Record], ranges: Ranges) -> Callable[[Sample[Any]]
 
     def value(sample: Sample[Any]) -> Record:
         numbers: dict[str, Any] = {}
+        said = sample.value.get(key) if key else sample.value
+        if not isinstance(said, dict):
+            raise Unusable(f"there is no object {key!r} in {sample.source.name if sample.source else 'it'}")
         try:
             for f in fields:
-                if f.name in sample.value or f.name in required:
+                if f.name in said or f.name in required:
                     low, high = range_of(f, ranges)
                     number = number_at(
-                        sample.value, f"/{f.name}", f.spec.unit or "1", low=low, high=high,
+                        said, f"/{f.name}", f.spec.unit or "1", low=low, high=high,
                         unit_in_wiring=f.spec.unit or "1",
                     )  # fmt: skip
                     if f.spec.kind not in ("f8", "f4") and not number.is_integer():

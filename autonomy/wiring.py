@@ -5,7 +5,8 @@ A stack is a JSON file, one entry per component:
     {"follow": {"module": "autonomy.follow:Follow", "every": 4, "phase": 2,
                 "inputs": {"pose": "localise/pose"}, "params": {"lookahead_m": 3.0}}}
 
-The entry "actuators" has no module: it names the command that the HAL obeys. Each entry also stands in the store, as
+The entry "actuators" has no module: it names the command that the HAL obeys. Where the module is "files", a script is
+the component. Each entry also stands in the store, as
 the JSON object `<component>/config`; writing it there rewires a running system.
 """
 
@@ -16,6 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from .files import FILES
 from .loading import inputs_of, load_module, make_module
 from .module import ModuleError
 from .pointer import split
@@ -43,6 +45,11 @@ class Wire:
     latency_cycles: int = 0
     budget_ms: float | None = None
     memory_mb: float | None = None
+
+    @property
+    def is_files(self) -> bool:
+        """Whether a script is it, through the file server."""
+        return self.module == FILES
 
     def entry(self) -> dict[str, Any]:
         """Give the entry of a stack file that says the same."""

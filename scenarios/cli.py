@@ -56,7 +56,11 @@ def drive(
     ] = "none",
     out: Annotated[Path, typer.Option(help="Folder for runs.")] = Path("runs"),
     use: Annotated[
-        list[str] | None, typer.Option(help="COMPONENT=FILE.py:Class swaps one module of the stack.")
+        list[str] | None,
+        typer.Option(help="COMPONENT=FILE.py:Class swaps one module of the stack; COMPONENT=files: a script is it."),
+    ] = None,
+    listen: Annotated[
+        str | None, typer.Option(help="Where scripts find the file server, such as tcp:127.0.0.1:5640.")
     ] = None,
     db: Annotated[
         str | None, typer.Option(help="Put the store where `fairway db` in another terminal sees it.")
@@ -105,7 +109,7 @@ def drive(
     folder.mkdir(parents=True, exist_ok=True)
     setup = Setup(
         scenario=plan, seed=seed, stack=stack, db=db, by_hand=by_hand, shuffle=shuffle, faults=folder,
-        level=level, plant=plant, randomise=randomise, placement=placement,  # type: ignore[arg-type]
+        level=level, plant=plant, randomise=randomise, placement=placement, listen=listen,  # type: ignore[arg-type]
     )  # fmt: skip
     console = Console()
     if by_hand:

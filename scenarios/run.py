@@ -25,6 +25,8 @@ from hal.bus import Level
 from hal.signals import FollowState, GuardState, Hold, ModuleState, ModuleStatus, Scene, SystemState
 from rtdb import Object, Record, Store
 from rtdb.recorder import Recorder
+from rtdb.syncfs.process import spawn as spawn_server
+from rtdb.syncfs.seats import SeatSpec
 from sim.cart import PlantKind
 from sim.world import World
 
@@ -58,7 +60,8 @@ class Setup:
     randomise: what else the seed changes, see scenarios/randomise.py; truth: the truth is written, False where nobody
     records it;
     agent: component that the caller of `tick` asks and answers (`Drive.agent`), as a gymnasium environment does;
-    make_world: gives the world of a scene, which stays its caller's, instead of one that ends with the drive.
+    make_world: gives the world of a scene, which stays its caller's, instead of one that ends with the drive;
+    listen: where the file server of components without modules does [the store's own socket].
     """
 
     scenario: Scenario
@@ -75,6 +78,7 @@ class Setup:
     truth: bool = True
     agent: str | None = None
     make_world: Callable[[Scene], World] | None = None
+    listen: str | None = None
 
 
 class Drive:
@@ -93,7 +97,8 @@ class Drive:
         self._hosts: list[Host] = []
         self.simulated: SimulatedCart | None = None
         self.agent: Host | None = None
-        apart = setup.placement == "process" or setup.shuffle is not None
+        self._scripts = {wire.component: wire for wire in self.stack.wires if wire.is_files}
+        apart = setup.placement == "process" or setup.shuffle is not None or bool(self._scripts)
         name = setup.db if setup.db is not None else f"drive-{os.getpid()}" if apart else None
         self.cart = Store.create(name, tick_ns=TICK_NS, t0_ns=scenario.t0_ns, size=STORE_BYTES, deterministic=True)
         self.world = Store.create(None, tick_ns=TICK_NS, t0_ns=scenario.t0_ns)
@@ -132,6 +137,7 @@ class Drive:
         ends: dict[str, type[Record]] = {cls.__name__: cls for cls in (FollowState, GuardState)}
         self._ends = [self.cart.find(n, ends[record]) for n, record in objects.items() if record in ends]
         self._statuses = [self.cart.find(n, ModuleStatus) for n, record in objects.items() if record == "ModuleStatus"]
+        self._statuses += [self.cart.find(f"{component}/status") for component in self._scripts]
 
     def _list_work(self) -> None:
         assert self.simulated is not None
@@ -143,7 +149,12 @@ class Drive:
 
     def _start_modules(self, name: str | None) -> None:
         here: list[Wire] = []
+        if self._scripts and name is not None:
+            seats = [seat_of(wire) for wire in self._scripts.values()]
+            self._children["files"] = spawn_server(name, seats, self.setup.listen)
         for wire in self.stack.wires:
+            if wire.is_files:
+                continue
             apart = self._order.random() < 0.5 if self._order else self.setup.placement == "process"
             if apart and name is not None and wire.component != self.setup.agent:
                 delay_seed = None if self._order is None else self._order.randrange(1 << 32)
@@ -160,7 +171,7 @@ class Drive:
         self.agent = asked[0] if asked else None
 
     def _wait_for_stack(self) -> None:
-        """Tick 1 waits for every component that the stack names."""
+        """Tick 1 waits for every component that the stack names; for whoever is a script, as long as it takes."""
         wanted = {wire.component for wire in self.stack.wires}
         deadline = time.monotonic() + PARTICIPANT_S
         while True:
@@ -171,6 +182,8 @@ class Drive:
             for component, child in self._children.items():
                 if child.poll() is not None:
                     raise DriveError(f"the process of {component} ended at once", invalid=False)
+            if missing <= set(self._scripts):
+                deadline = time.monotonic() + PARTICIPANT_S
             if time.monotonic() > deadline:
                 names = ", ".join(sorted(missing))
                 raise DriveError(f"{names} did not come within {PARTICIPANT_S:.0f} s", invalid=False)
@@ -267,12 +280,26 @@ class Drive:
         self.close()
 
 
+def seat_of(wire: Wire) -> SeatSpec:
+    """Give the seat that the file server keeps for a component without a module."""
+    return SeatSpec(
+        component=wire.component,
+        every=wire.every,
+        phase=wire.phase,
+        latency_cycles=wire.latency_cycles,
+        config=wire.entry(),
+    )
+
+
 def is_end(shown: object) -> bool:
     """Say whether somebody will not go on: it has arrived, is far astray, or failed for good."""
     if isinstance(shown, FollowState):
         return shown.finished
     if isinstance(shown, GuardState):
         return shown.hold is Hold.OUTSIDE
+    if isinstance(shown, dict):  # a script's status: FollowState as JSON
+        state = shown.get("state")
+        return isinstance(state, dict) and state.get("finished") is True
     return isinstance(shown, ModuleStatus) and shown.state is ModuleState.FAULT
 
 
@@ -335,7 +362,7 @@ def drive(
     begin: called once the cart stands assembled, with its stores; may give somebody who looks on. Ctrl-C raises
     KeyboardInterrupt between two cycles, so that the recording is whole up to there.
     """
-    with ctrl_c_between_cycles() as pressed, Drive(setup) as run, ExitStack() as stack:
+    with Drive(setup) as run, ctrl_c_between_cycles() as pressed, ExitStack() as stack:
         recorder = stack.enter_context(Recorder(recording, [run.cart, run.world], metadata(setup)))
         observer = begin([run.cart, run.world]) if begin is not None else None
         begun_s = time.monotonic()

@@ -161,8 +161,8 @@ class Seat:
 
     def idle(self, now_s: float) -> None:
         """Look at it by the host's clock: a barrier does not wait for ever."""
-        if self._component is None or self._waiting or self._store.clock.kind is Kind.REAL:
-            return
+        if self._component is None or self._begun is None or self._waiting or self._store.clock.kind is Kind.REAL:
+            return  # who has not begun is waited for: people type slowly
         if now_s - self._since_s > self._patience_s:
             cycle = self._store.cycle
             log.warning("%s did not come back for %g s in cycle %d", self.spec.component, self._patience_s, cycle)
