@@ -62,6 +62,9 @@ def drive(
     listen: Annotated[
         str | None, typer.Option(help="Where scripts find the file server, such as tcp:127.0.0.1:5640.")
     ] = None,
+    token: Annotated[
+        list[str] | None, typer.Option(metavar="COMPONENT=TOKEN", help="A script's token, instead of one by chance.")
+    ] = None,
     db: Annotated[
         str | None, typer.Option(help="Put the store where `fairway db` in another terminal sees it.")
     ] = None,
@@ -110,6 +113,7 @@ def drive(
     setup = Setup(
         scenario=plan, seed=seed, stack=stack, db=db, by_hand=by_hand, shuffle=shuffle, faults=folder,
         level=level, plant=plant, randomise=randomise, placement=placement, listen=listen,  # type: ignore[arg-type]
+        tokens=dict(text.partition("=")[::2] for text in token or ()),
     )  # fmt: skip
     console = Console()
     if by_hand:

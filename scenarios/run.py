@@ -11,9 +11,9 @@ import random
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
@@ -61,7 +61,8 @@ class Setup:
     records it;
     agent: component that the caller of `tick` asks and answers (`Drive.agent`), as a gymnasium environment does;
     make_world: gives the world of a scene, which stays its caller's, instead of one that ends with the drive;
-    listen: where the file server of components without modules does [the store's own socket].
+    listen: where the file server of components without modules does [the store's own socket]; tokens: theirs, by
+    component, where they shall not be made by chance.
     """
 
     scenario: Scenario
@@ -79,6 +80,7 @@ class Setup:
     agent: str | None = None
     make_world: Callable[[Scene], World] | None = None
     listen: str | None = None
+    tokens: Mapping[str, str] = field(default_factory=dict)
 
 
 class Drive:
@@ -151,7 +153,7 @@ class Drive:
         here: list[Wire] = []
         if self._scripts and name is not None:
             seats = [seat_of(wire) for wire in self._scripts.values()]
-            self._children["files"] = spawn_server(name, seats, self.setup.listen)
+            self._children["files"] = spawn_server(name, seats, self.setup.listen, self.setup.tokens)
         for wire in self.stack.wires:
             if wire.is_files:
                 continue

@@ -150,10 +150,12 @@ class Client:
             self._clunk(fid)
 
     def rewrite(self, path: str, data: bytes) -> None:
-        """Write a file that stays open. Short ones are revisions at once; what is wrong with them shows in health."""
+        """Write a file that stays open, a revision each time."""
+        new = (path, O_WRONLY) not in self._open
         fid = self._kept(path, O_WRONLY)
         self._put(fid, data)
-        self._call("Tfsync", fid, 0)
+        if new or len(data) >= self._piece:
+            self._call("Tfsync", fid, 0)
 
     def write_json(self, path: str, document: Any) -> None:
         """Write an object as JSON, into a file that stays open."""

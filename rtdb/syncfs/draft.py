@@ -75,8 +75,7 @@ class Draft:
         if len(piece) < self._piece:
             self._ended += 1
             if self.single and not self.truncated:
-                self._commit(bytes(data))
-                self.dirty = False
+                self.finish()
 
     def _begin_anew(self) -> None:
         if self._data is not None and not (self.truncated and not self._data):

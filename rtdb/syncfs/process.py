@@ -9,7 +9,7 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -21,12 +21,20 @@ from .seats import SeatSpec
 from .server import FileServer, run
 
 
-def spawn(store_name: str, seats: Sequence[SeatSpec], listen: str | None, *, group: int | None = None) -> "Any":
+def spawn(
+    store_name: str,
+    seats: Sequence[SeatSpec],
+    listen: str | None,
+    tokens: Mapping[str, str],
+    *,
+    group: int | None = None,
+) -> "subprocess.Popen[str]":
     """Start a file server for some components of a store. It ends with its standard input.
 
-    listen: an address, None for the store's own socket; group: process group, 0 for one of its own.
+    listen: an address, None for the store's own socket; tokens: of those that shall not have one by chance;
+    group: process group, 0 for one of its own.
     """
-    job = {"store": store_name, "listen": listen, "seats": [asdict(seat) for seat in seats]}
+    job = {"store": store_name, "listen": listen, "seats": [asdict(seat) for seat in seats], "tokens": dict(tokens)}
     child = subprocess.Popen(
         [sys.executable, "-m", "rtdb.syncfs.process"], stdin=subprocess.PIPE, text=True, process_group=group
     )
@@ -43,7 +51,7 @@ def main() -> int:
         job = json.loads(sys.stdin.readline())
         seats, tokens = [SeatSpec(**seat) for seat in job["seats"]], Tokens()
         for seat in seats:
-            tokens.give(seat.component)
+            tokens.give(seat.component, job["tokens"].get(seat.component))
         address = Address.parse(job["listen"]) if job["listen"] else default_address(job["store"])
         server = FileServer(job["store"], seats=seats, tokens=tokens)
 

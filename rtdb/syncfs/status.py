@@ -75,7 +75,7 @@ class StatusView:
         write = core.visible_write(handle, cycle)
         if write != self._write:
             raw = core.read(handle, write) if write else None
-            self._write, self._written = write, (b"", 0) if raw is None else (raw[0].rstrip(b"\0"), raw[2])
+            self._write, self._written = write, (b"", 0) if raw is None else (raw[0].partition(b"\0")[0], raw[2])
         return self._written
 
     @staticmethod

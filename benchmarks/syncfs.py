@@ -1,0 +1,278 @@
+"""How quick the file server is, each client a process: small operations, barrier, and edges in real time.
+
+    python benchmarks/syncfs.py [ops] [barrier] [100ms] [10ms] [1ms] [--seconds 30] [--load]
+
+ops: reads of 100 bytes, against a bare asyncio server that answers as many bytes. The others: N components, each stats
+its clock, reads the status of four others and writes its own; 100ms and 1ms as any process, 10ms with SCHED_FIFO where
+the system grants it. --load: two busy loops beside it. The issue's 10 minutes: `100ms --seconds 600`.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path[0] = str(Path(__file__).parents[1])  # beside this file stands rtdb.py, which is not the package
+
+from rtdb import Store, realtime
+from rtdb.syncfs import Address, Client, FileServer, Pace, SeatSpec, Tokens, run
+from rtdb.syncfs.codec import LINUX, TYPES
+from rtdb.syncfs.server import new_loop
+
+BYTES = 100
+TREAD = LINUX.encode[TYPES["Tread"]]
+OPS_S, ROUNDS = 2.0, 3
+
+
+# -- processes --------------------------------------------------------------------------------------------------------
+
+
+def child(*job: object) -> "subprocess.Popen[str]":
+    command = [sys.executable, __file__, "--job", json.dumps(job)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def said(process: "subprocess.Popen[str]") -> Any:
+    assert process.stdout is not None
+    return json.loads(process.stdout.readline())
+
+
+def tell(value: Any) -> None:
+    print(json.dumps(value), flush=True)
+
+
+@contextlib.contextmanager
+def server(*job: object) -> Iterator["subprocess.Popen[str]"]:
+    process = child(*job)
+    said(process)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def together(clients: list["subprocess.Popen[str]"]) -> list[Any]:
+    """Let clients that are ready begin at the same time, and gather what they found."""
+    for process in clients:
+        said(process)
+    for process in clients:
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+    found = [said(process) for process in clients]
+    for process in clients:
+        process.wait()
+    return found
+
+
+# -- small operations -------------------------------------------------------------------------------------------------
+
+
+def serve_ops(address: str, plain: bool) -> None:
+    with Store.create(f"bench-{os.getpid()}", clock="real", size=64 << 20) as store:
+        store.run_clock()
+        assert store.name is not None
+        run(FileServer(store.name), [Address.parse(address)], ready=lambda _: tell("up"), plain=plain)
+
+
+class Echo(asyncio.Protocol):
+    """Answers each request of 23 bytes with as many bytes as a read has: the yardstick."""
+
+    def connection_made(self, transport: Any) -> None:
+        self.write, self.reply = transport.write, bytes(11 + BYTES)
+
+    def data_received(self, data: bytes) -> None:
+        for _ in range(len(data) // 23):
+            self.write(self.reply)
+
+
+def serve_echo(address: str, plain: bool) -> None:
+    async def serve() -> None:
+        where, loop = Address.parse(address), asyncio.get_running_loop()
+        if where.path is not None:
+            await loop.create_unix_server(Echo, str(where.path))
+        else:
+            await loop.create_server(Echo, where.host, where.port)
+        tell("up")
+        await asyncio.Event().wait()
+
+    with asyncio.Runner(loop_factory=asyncio.new_event_loop if plain else new_loop) as runner:
+        runner.run(serve())
+
+
+def ask(address: str, window: int, echo: bool) -> None:
+    """Keep `window` reads under way for a while; tells how many were answered in a second."""
+    if echo:
+        where = Address.parse(address)
+        sock = socket.socket(socket.AF_UNIX if where.path is not None else socket.AF_INET)
+        sock.connect(str(where.path) if where.path is not None else (where.host, where.port))
+        fid = 0
+    else:
+        client = Client.connect(address)
+        fid, sock = client._kept("/notes", 0), client._sock
+    requests, n_bytes = b"".join(TREAD(tag, fid, 0, 4096) for tag in range(window)), window * (11 + BYTES)
+    tell("ready")
+    sys.stdin.readline()
+    begun, count = time.perf_counter(), 0
+    while time.perf_counter() - begun < OPS_S:
+        sock.sendall(requests)
+        got = 0
+        while got < n_bytes:
+            got += len(sock.recv(1 << 16))
+        count += window
+    tell(count / (time.perf_counter() - begun))
+
+
+def ops(folder: Path) -> None:
+    print(f"small operations: reads of {BYTES} bytes, per second; median of {ROUNDS} (bare asyncio; ratio)")
+    for plain in (True, False):
+        for kind in ("unix", "tcp"):
+            with socket.socket() as free:
+                free.bind(("127.0.0.1", 0))
+                port = free.getsockname()[1]
+            mine = f"unix:{folder}/s" if kind == "unix" else f"tcp:127.0.0.1:{port}"
+            theirs = f"unix:{folder}/e" if kind == "unix" else f"tcp:127.0.0.1:{port + 1}"
+            with server("serve_ops", mine, plain), server("serve_echo", theirs, plain):
+                with Client.connect(mine) as client:
+                    client.write("/notes", bytes(BYTES))
+                    for _ in range(2):
+                        client.wait()
+                for clients, window in ((4, 1), (2, 16)):
+                    found: dict[bool, list[float]] = {True: [], False: []}
+                    for _ in range(ROUNDS):
+                        for echo, address in ((False, mine), (True, theirs)):
+                            asked = [child("ask", address, window, echo) for _ in range(clients)]
+                            found[echo].append(sum(together(asked)))
+                    got, bare = (statistics.median(found[echo]) for echo in (False, True))
+                    print(
+                        f"  {'asyncio' if plain else 'uvloop '} {kind:4} {clients} clients, {window:2} under way: "
+                        f"{got:7,.0f}/s ({bare:7,.0f}/s; {got / bare:.2f})",
+                        flush=True,
+                    )
+
+
+# -- edges ------------------------------------------------------------------------------------------------------------
+
+
+def serve_edges(address: str, clock: str, tick_ns: int, every: int, names: list[str], fifo: bool) -> None:
+    got = realtime() if fifo else None
+    with Store.create(f"bench-{os.getppid()}", clock=clock, tick_ns=tick_ns, size=64 << 20) as store:
+        seats = [SeatSpec(component=n, every=every, phase=0, latency_cycles=every - 1) for n in names]
+        tokens = Tokens(dict(zip(names, names, strict=True)))
+        assert store.name is not None
+        files = FileServer(store.name, pace=Pace(every), seats=seats, tokens=tokens)
+        store.run_clock(tuple(names) if clock == "barrier" else ())
+        run(files, [Address.parse(address)], ready=lambda _: tell(list(got.refused) if got else []))
+
+
+def component(address: str, name: str, others: list[str], seconds: float, db: str, fifo: bool) -> None:
+    """Be a component: tells edges, missed ones, and how late it was woken, in us."""
+    if fifo:
+        realtime(40)
+    with Store.attach(db) as store:
+        offset_ns = store.now_ns - time.monotonic_ns()
+    with Client.connect(address, name) as client:
+        clock, status = f"/{name}/clock", f"/{name}/status"
+        client.rewrite(status, b'{"n": 0}\n')
+        tell("ready")
+        sys.stdin.readline()
+        fid = client._kept(clock, -1)
+        late_us, missed, last, end = [], 0, None, time.monotonic() + seconds
+        while time.monotonic() < end:
+            values = client._call("Tgetattr", fid, 0x3FFF)
+            woken_ns = time.monotonic_ns() + offset_ns
+            late_us.append((woken_ns - values[12] * 1_000_000_000 - values[13]) / 1000)
+            if last is not None and values[19] > last + 1:
+                missed += values[19] - last - 1
+            last = values[19]
+            for other in others:
+                client.read(f"/{other}/status")
+            client.rewrite(status, b'{"n": %d}\n' % last)
+        report = client.read_json("/server")
+    late_us.sort()
+    tell(
+        {"edges": len(late_us), "missed": missed, "late_us": late_us[:: max(1, len(late_us) // 2000)], "server": report}
+    )
+
+
+def edges(folder: Path, what: str, clock: str, tick_ns: int, every: int, n: int, seconds: float, fifo: bool) -> None:
+    address, names = f"unix:{folder}/edges", [f"c{k}" for k in range(n)]
+    job = ("serve_edges", address, clock, tick_ns, every, names, fifo)
+    process = child(*job)
+    try:
+        refused = said(process)
+        db = f"bench-{os.getpid()}"
+        clients = [
+            child("component", address, name, [names[(k + j) % n] for j in range(1, 5)], seconds, db, fifo)
+            for k, name in enumerate(names)
+        ]
+        found = together(clients)
+    finally:
+        process.terminate()
+        process.wait()
+    late = sorted(us for one in found for us in one["late_us"])
+    seen, missed = sum(one["edges"] for one in found), sum(one["missed"] for one in found)
+    scheduling = "any process" if not fifo else "SCHED_FIFO" + (f" (refused: {'; '.join(refused)})" if refused else "")
+    print(f"{what}: {n} components, {seconds:g} s, {scheduling}")
+    if clock == "barrier":
+        print(f"  {max(one['edges'] for one in found) / seconds:.0f} edges/s")
+        return
+    print(
+        f"  missed {missed} of {seen + missed} edges ({100 * missed / (seen + missed):.3f} %); edge to woken: "
+        f"median {late[len(late) // 2]:.0f} us, p99 {late[len(late) * 99 // 100]:.0f} us, max {late[-1]:.0f} us"
+    )
+    for key, text in (("heard_us", "server heard of the edge"), ("answered_us", "had answered all who waited")):
+        bins = found[0]["server"][key]
+        print(f"  {text}: " + ", ".join(f"<{2 << k} us {count}" for k, count in enumerate(bins) if count))
+
+
+# -- which ------------------------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", nargs="*", help="ops, barrier, 100ms, 10ms, 1ms [all]")
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--load", action="store_true")
+    parser.add_argument("--job", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.job:
+        name, *values = json.loads(args.job)
+        {f.__name__: f for f in (serve_ops, serve_echo, ask, serve_edges, component)}[name](*values)
+        return
+    wanted = args.what or ["ops", "barrier", "100ms", "10ms", "1ms"]
+    print(
+        f"{os.cpu_count()} CPUs, load {os.getloadavg()[0]:.1f}, {'two busy loops' if args.load else 'nothing'} beside it"
+    )
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 if args.load else 0)]
+    try:
+        with tempfile.TemporaryDirectory() as place:
+            folder, s = Path(place), args.seconds
+            rows = {
+                "ops": lambda: ops(folder),
+                "barrier": lambda: edges(folder, "barrier", "barrier", 10_000_000, 1, 32, min(s, 10.0), False),
+                "100ms": lambda: edges(folder, "100 ms", "real", 10_000_000, 10, 32, s, False),
+                "10ms": lambda: edges(folder, "10 ms", "real", 10_000_000, 1, 16, s, True),
+                "1ms": lambda: edges(folder, "1 ms", "real", 1_000_000, 1, 4, min(s, 10.0), False),
+            }
+            for row in wanted:
+                rows[row]()
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
+if __name__ == "__main__":
+    main()
