@@ -14,6 +14,7 @@ from rtdb.syncfs.cli import register as register_files
 
 from .cli_regression import register as register_regression
 from .cli_running import register as register_running
+from .cli_running import tokens_of
 from .folder import Interrupted
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def drive(
     setup = Setup(
         scenario=plan, seed=seed, stack=stack, db=db, by_hand=by_hand, shuffle=shuffle, faults=folder,
         level=level, plant=plant, randomise=randomise, placement=placement, listen=listen,  # type: ignore[arg-type]
-        tokens=dict(text.partition("=")[::2] for text in token or ()),
+        tokens=tokens_of(stack, token or []),
     )  # fmt: skip
     console = Console()
     if by_hand:

@@ -36,7 +36,14 @@ def run(
         str, typer.Argument(help="Scenario id (`fairway ls` lists them), or path of a .scenario.yaml.")
     ] = "p545/field-trial",
     use: Annotated[
-        list[str] | None, typer.Option(help="COMPONENT=FILE.py:Class swaps one module of the stack.")
+        list[str] | None,
+        typer.Option(help="COMPONENT=FILE.py:Class swaps one module of the stack; COMPONENT=files: a script is it."),
+    ] = None,
+    listen: Annotated[
+        str | None, typer.Option(help="Where scripts find the file server, such as tcp:127.0.0.1:5640.")
+    ] = None,
+    token: Annotated[
+        list[str] | None, typer.Option(metavar="COMPONENT=TOKEN", help="A script's token, instead of one by chance.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of all randomness.", min=0)] = 0,
     level: Annotated[str, typer.Option(help="direct (messages) or wire (true bytes).")] = "wire",
@@ -67,7 +74,8 @@ def run(
     folder.mkdir(parents=True, exist_ok=True)
     setup = RunSetup(
         scenario=plan, stack=stack, folder=folder, db=db or f"run-{os.getpid()}", seed=seed,
-        level="direct" if level == "direct" else "wire", for_s=for_s, realtime=realtime,
+        level="direct" if level == "direct" else "wire", for_s=for_s, realtime=realtime, listen=listen,
+        tokens=tokens_of(stack, token or []),
     )  # fmt: skip
     raise typer.Exit(_run(setup))
 
@@ -81,6 +89,17 @@ def with_whole_paths(stack: "Stack") -> "Stack":
         return f"{Path(path).resolve()}{colon}{name}" if path.endswith(".py") else module
 
     return replace(stack, wires=tuple(replace(wire, module=whole(wire.module)) for wire in stack.wires))
+
+
+def tokens_of(stack: "Stack", said: list[str]) -> dict[str, str]:
+    """Read what --token says; only scripts have one."""
+    scripts = [wire.component for wire in stack.wires if wire.is_files]
+    tokens = dict(text.partition("=")[::2] for text in said)
+    for component, text in tokens.items():
+        if component not in scripts or not text:
+            known = ", ".join(scripts) or "none; --use COMPONENT=files makes one"
+            raise typer.BadParameter(f"{component}: expected COMPONENT=TOKEN of a script; there is {known}")
+    return tokens
 
 
 def _run(setup: "RunSetup") -> int:

@@ -3,6 +3,7 @@
     supervisor ┬─ clock      ticks, in C                       scenarios/clock_process.py
                ├─ hal        drivers, and the simulated cart   scenarios/cart_process.py
                ├─ MODULE     one each                          autonomy/process.py
+               ├─ files      for scripts, if there are any     rtdb/syncfs/process.py
                └─ recorder   looks on                          scenarios/recorder_process.py
 
 Who has ended is restarted if nobody drives by it: a module that the command does not need, the recorder. Anything else
@@ -11,11 +12,12 @@ sees for itself that they are gone. Nothing here commands the cart; the supervis
 """
 
 import json
+import math
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -30,18 +32,19 @@ from hal.bus import Level
 from hal.errors import HalError
 from hal.signals import FollowState, GuardState, ModuleState, ModuleStatus, Odometry, SafetyState, SystemState
 from rtdb import Record, RtdbError, State, Store, Writer
+from rtdb.syncfs.process import spawn as spawn_server
 
 from .cart import TICK_NS, DriveError
 from .cart_process import ORDERS
 from .course import CourseImpossible
 from .plan import course_record, rng_of
 from .rewire import stack_of
-from .run import SETTLE_S, STORE_BYTES, Setup, ending, is_end, metadata
+from .run import SETTLE_S, STORE_BYTES, Setup, ending, is_end, metadata, seat_of
 from .scenario import Scenario
 
 R = TypeVar("R", bound=Record)
-Kind = Literal["clock", "hal", "recorder", "module"]
-PRIORITY: dict[Kind, int | None] = {"clock": 80, "hal": 70, "module": 60, "recorder": None}
+Kind = Literal["clock", "hal", "recorder", "module", "files"]
+PRIORITY: dict[Kind, int | None] = {"clock": 80, "hal": 70, "module": 60, "files": 55, "recorder": None}
 RESTARTS, RESTARTS_S = 3, 10.0
 HANG_CYCLES = 200  # a module that finished nothing for so long hangs
 TELL_S = 10.0
@@ -54,7 +57,9 @@ QUIT_S = 2.0  # for a process that was asked to go
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunSetup:
-    """What to run. db: name of the cart's store; for_s: how long at most; realtime: ask for real-time priorities."""
+    """What to run. db: name of the cart's store; for_s: how long at most; realtime: ask for real-time priorities;
+    listen, tokens: of the file server, where a script is a component, see scenarios.run.Setup.
+    """
 
     scenario: Scenario
     stack: Stack
@@ -64,6 +69,13 @@ class RunSetup:
     level: Level = "wire"
     for_s: float | None = None
     realtime: bool = False
+    listen: str | None = None
+    tokens: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def scripts(self) -> list[Wire]:
+        """The components that are scripts."""
+        return [wire for wire in self.stack.wires if wire.is_files]
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,10 +170,17 @@ class Supervisor:
             },
         )
         self._wait("hal", lambda: self._has("actuators/config"))  # what modules may be wired to
+        if setup.scripts:
+            self._start_files()
+            self._wait(
+                "scripts", lambda: all(self._has(f"{wire.component}/status") for wire in setup.scripts), math.inf
+            )
         for wire in setup.stack.wires:
-            self._start_module(wire)
+            if not wire.is_files:
+                self._start_module(wire)
         self._start_recorder()
-        for name in names:
+        modules = [wire.component for wire in setup.stack.wires if not wire.is_files]
+        for name in modules:
             self._wait(name, lambda name=name: self._is_ready(name))  # type: ignore[misc]
         self._start("clock", "clock", {"wait_for": [*names, "hal", "supervisor"]})
         self._wait("the first tick", lambda: self.cart.cycle > 0)
@@ -184,6 +203,11 @@ class Supervisor:
         process = spawn(setup.db, (wire,), setup.seed, faults=setup.folder, behind=behind, priority=priority, group=0)
         self._adopt(Child("module", wire.component, process))
 
+    def _start_files(self) -> None:
+        setup = self.setup
+        seats = [seat_of(wire) for wire in setup.scripts]
+        self._adopt(Child("files", "files", spawn_server(setup.db, seats, setup.listen, setup.tokens, group=0)))
+
     def _start_recorder(self) -> None:
         setup, self._recordings = self.setup, self._recordings + 1
         said = metadata(Setup(scenario=setup.scenario, seed=setup.seed, level=setup.level)) | {"clock": "real"}
@@ -196,8 +220,8 @@ class Supervisor:
         child.restarts_s = known.restarts_s if known is not None else []
         self._children[key] = child
 
-    def _wait(self, what: str, is_there: Callable[[], bool]) -> None:
-        deadline_s = time.monotonic() + START_S
+    def _wait(self, what: str, is_there: Callable[[], bool], longest_s: float = START_S) -> None:
+        deadline_s = time.monotonic() + longest_s
         while not is_there():
             for child in self._children.values():
                 if (code := child.process.poll()) is not None:
@@ -255,7 +279,7 @@ class Supervisor:
 
     def _look_after(self) -> str:
         """See who has ended, and do what is to be done; gives why the cart must stop, empty if it need not."""
-        order: dict[Kind, int] = {"clock": 0, "hal": 1, "module": 2, "recorder": 3}  # causes before effects
+        order: dict[Kind, int] = {"clock": 0, "hal": 1, "files": 2, "module": 3, "recorder": 4}  # causes before effects
         for child in sorted(self._children.values(), key=lambda child: order[child.kind]):
             code = child.process.poll()
             if code is None and not child.gone and (hangs := self._hangs(child)):
@@ -269,7 +293,8 @@ class Supervisor:
             if code is None or child.gone:
                 continue
             now_s = time.monotonic()
-            is_required = child.kind == "module" and child.name in self._required
+            names = [wire.component for wire in self.setup.scripts] if child.kind == "files" else [child.name]
+            is_required = child.kind in ("module", "files") and not self._required.isdisjoint(names)
             do = what_to_do(child.kind, is_required, child.restarts_s, now_s)
             what = f"{child.name} ended in cycle {self.cart.cycle} ({ending(code)})"
             if child.kind == "hal":
@@ -300,7 +325,8 @@ class Supervisor:
     def _blame(self) -> str:
         """Say which of the modules that the cart drives by does not run, and why; empty if all do."""
         for name in sorted(self._required):
-            status = self._newest(f"{name}/status", ModuleStatus) if self._has(f"{name}/status") else None
+            said = self.cart.objects(f"{name}/status", record=ModuleStatus)  # a script's is JSON
+            status = self._newest(f"{name}/status", ModuleStatus) if said else None
             if status is not None and status.state is not ModuleState.RUNNING:
                 return f": {name} is {status.state.name}: {status.reason}"
         return ""
@@ -308,6 +334,9 @@ class Supervisor:
     def _restart(self, child: Child) -> None:
         if child.kind == "recorder":
             self._start_recorder()
+            return
+        if child.kind == "files":
+            self._start_files()
             return
         wire = next(wire for wire in self.setup.stack.wires if wire.component == child.name)
         with suppress(RtdbError, ModuleError):  # as it is wired now, if that can be read
@@ -384,7 +413,7 @@ class Supervisor:
             elif wait:
                 self._order_stop("the supervisor ends")
                 hal.quit(END_S)
-        last: dict[Kind, int] = {"hal": 0, "recorder": 1, "module": 2, "clock": 3}
+        last: dict[Kind, int] = {"hal": 0, "recorder": 1, "module": 2, "files": 3, "clock": 4}
         children = sorted(self._children.values(), key=lambda child: last[child.kind])
         for child in children:
             if child.kind == "module":
