@@ -153,6 +153,10 @@ class Client:
         """Write a file that stays open, a revision each time."""
         new = (path, O_WRONLY) not in self._open
         fid = self._kept(path, O_WRONLY)
+        if not data:
+            self._call("Tsetattr", fid, 8, 0, 0, 0, 0, 0, 0, 0, 0)
+            self._call("Tfsync", fid, 0)
+            return
         self._put(fid, data)
         if new or len(data) >= self._piece:
             self._call("Tfsync", fid, 0)

@@ -1,7 +1,8 @@
 """Contents of files as objects of the store: any number of bytes, a revision per write, seen through cuts.
 
-An object has slots of one size, a file grows. So a file's content is a row of objects, `files/1`, `files/2`, ...: what
-a cut shows is that of the youngest that shows anything. An older one goes when the one behind it is seen.
+An object has slots of one size, and so many; a file grows, and may be written often. So a file's content is a row of
+objects, `files/1`, `files/2`, ...: what a cut shows is that of the youngest that shows anything. A larger revision, or
+one more in a cycle than a ring holds, begins a new one, and an older one goes when the one behind it is seen.
 """
 
 import contextlib
@@ -10,7 +11,7 @@ import struct
 from collections.abc import Callable
 
 from ..components import Component
-from ..errors import Deleted, ObjectMissing, TooFast
+from ..errors import AgedOut, Deleted, ObjectMissing, StoreFull, TooFast
 from ..layout import Field, Spec
 from ..objects import HOST_DEPENDENT, Writer
 from ..records import Record, Schema
@@ -43,12 +44,13 @@ def slots_for(room: int) -> int:
 class Content:
     """What one file holds. Revisions are written to the store at once; each shows from the next edge on."""
 
-    __slots__ = ("_files", "_seen", "held", "newest", "numbers", "rooms")
+    __slots__ = ("_files", "_seen", "_slots", "held", "newest", "numbers", "rooms")
 
     def __init__(self, files: "Contents", numbers: list[int] | None = None) -> None:
         self._files = files
         self.numbers: list[int] = numbers or []  # of its objects, oldest first
-        self.rooms = [files.store.core.object(files.handle(k))[4] - _COUNT.size for k in self.numbers]
+        self.rooms = [files.room(k) for k in self.numbers]
+        self._slots = 0  # of the youngest
         self._seen: tuple[int, int, bytes, int] = (0, 0, b"", 0)  # the revision that was looked at last
         self.newest = b""  # the newest revision, whether it shows already or not
         self.held = False  # it is not in the store yet: there were more revisions in this cycle than a ring holds
@@ -56,17 +58,28 @@ class Content:
     def write(self, data: bytes) -> None:
         """Write a revision. StoreFull where there is no room; the one before stands then."""
         if not self.numbers or len(data) > self.rooms[-1]:
-            self._grow(len(data))
+            self.grow(len(data))
         self.newest = data
-        self.held = not self._written(data)
+        self.held = not self._written(data) and not self._written_anew(data)
         if self.held:
             self._files.busy.add(self)
 
-    def _grow(self, n_bytes: int) -> None:
+    def grow(self, n_bytes: int, slots: int = 0) -> None:
+        """Begin an object with room for a revision. StoreFull where there is none."""
         room = room_for(n_bytes)
-        self.numbers.append(self._files.insert(room))
+        slots = max(slots, slots_for(room))
+        self.numbers.append(self._files.insert(room, slots))
         self.rooms.append(room)
+        self._slots = slots
         self._files.busy.add(self)
+
+    def _written_anew(self, data: bytes) -> bool:
+        """Write into a new object, with more slots: the ring is full for this cycle."""
+        try:
+            self.grow(len(data), 2 * self._slots)
+        except StoreFull:
+            return False
+        return self._written(data)
 
     def _written(self, data: bytes) -> bool:
         core, handle = self._files.store.core, self._files.handle(self.numbers[-1])
@@ -79,7 +92,7 @@ class Content:
 
     def read(self, cycle: int) -> tuple[bytes, int]:
         """Give what a cut shows, and the time of its writing; empty and 0 before the first revision."""
-        core = self._files.store.core
+        core, gone = self._files.store.core, False
         for number in reversed(self.numbers):
             try:
                 handle = self._files.handle(number)
@@ -89,10 +102,25 @@ class Content:
                     (count,) = _COUNT.unpack_from(raw[0])
                     self._seen = number, write, raw[0][_COUNT.size : _COUNT.size + count], raw[2]
             except (Deleted, ObjectMissing):
+                gone = True
                 continue
             if write:
                 return self._seen[2:]
+        if gone:
+            raise AgedOut("the history of this file does not reach back so far")
         return b"", 0
+
+    def take_newest(self) -> None:
+        """Take up the newest revision that a server before us wrote, seen or not."""
+        core = self._files.store.core
+        for number in reversed(self.numbers):
+            handle = self._files.handle(number)
+            head = core.object(handle)[11]
+            if head:
+                data = core.read(handle, head)[0]
+                (count,) = _COUNT.unpack_from(data)
+                self.newest = data[_COUNT.size : _COUNT.size + count]
+                return
 
     def edge(self, cycle: int) -> bool:
         """Write what is held, and drop objects that have been followed by a larger one; False when all is done."""
@@ -132,7 +160,13 @@ class Contents:
             raise ObjectMissing(f"{self._prefix}{number} is not kept any more")
         return handle
 
-    def insert(self, room: int) -> int:
+    def room(self, number: int) -> int:
+        """Give the bytes that an object's slots hold; 0 for one that is gone."""
+        with contextlib.suppress(Deleted, ObjectMissing):
+            return self.store.core.object(self.handle(number))[4] - _COUNT.size
+        return 0
+
+    def insert(self, room: int, slots: int) -> int:
         """Insert an object; returns its number."""
         number, period_s, before = self.last + 1, self._pace.every * self.store.tick_ns * 1e-9, self.store.core.version
         writer: Writer[Record] = self._component.insert(
@@ -140,8 +174,8 @@ class Contents:
             schema_for(room),
             every=self._pace.every,
             phase=self._pace.phase,
-            history_s=slots_for(room) * period_s,
-            budget_bytes=slots_for(room) * (room + 128),
+            history_s=slots * period_s,
+            budget_bytes=slots * (room + 128),
             flags=HOST_DEPENDENT,
         )
         self.last, self._handles[number] = number, writer.handle
@@ -167,7 +201,7 @@ class Contents:
                 self.busy.discard(content)
 
     def fits(self, n_bytes: int) -> bool:
-        """Say whether a first revision of that size would find room."""
+        """Say whether a first revision of that size finds room for sure."""
         room = room_for(n_bytes)
         return slots_for(room) * (room + 128) < self.store.memory[1]
 

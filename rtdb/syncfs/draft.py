@@ -1,36 +1,33 @@
 """Drafts: what is written through one open file, until it is a revision.
 
 A revision is whole: truncation, writes and close make one. A file that is kept open and written anew from offset 0
-gets a revision each time, without a tail of the one before; when it is finished shows only in the next write at 0, in
-fsync or in the close, unless the revision before was a single write: then each write is one.
+gets a revision each time, without a tail of the one before. When such a one is finished can be seen in a JSON file:
+when it is JSON. Elsewhere it shows in the next beginning, in fsync or the close, or as the file is left alone for a
+whole cycle; while revisions are one write each, in the end of that write. Appended writes are revisions, each one.
 """
 
+import contextlib
 import errno
 from collections.abc import Callable
 
+from ..errors import RtdbError
 from .errors import FsError
+
+SHOWN_AT_ONCE_BYTES = 1 << 16  # larger files that are appended to become a revision at edges only
 
 
 class Draft:
     """Sans I/O: `commit` is called with each finished revision.
 
-    base: gives the newest revision; most_bytes: of a revision; piece_bytes: a client splits its writes into pieces of
-    this size, so that a shorter one ends a write.
+    base: gives the newest revision; is_whole: says whether a content is complete, None where that cannot be seen;
+    most_bytes: of a revision; piece_bytes: a client splits its writes into pieces of this size, so that a shorter one
+    ends a write. created: the file was made for this, and nothing of it shows before the close.
     """
 
     __slots__ = (
-        "_base",
-        "_commit",
-        "_data",
-        "_ended",
-        "_most",
-        "_piece",
-        "append",
-        "dirty",
-        "idle",
-        "single",
-        "truncated",
-    )
+        "_base", "_commit", "_data", "_ended", "_is_whole", "_kept", "_most", "_piece", "_single", "_tail",
+        "append", "dirty", "idle", "truncated",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -40,13 +37,16 @@ class Draft:
         append: bool,
         most_bytes: int,
         piece_bytes: int,
+        is_whole: Callable[[bytes], bool | None] = lambda _: None,
+        created: bool = False,
     ) -> None:
-        self._base, self._commit, self.append = base, commit, append
+        self._base, self._commit, self._is_whole, self.append = base, commit, is_whole, append
         self._most, self._piece = most_bytes, piece_bytes
-        self._data: bytearray | None = None
+        self._data: bytearray | None = bytearray() if created and not append else None
+        self._tail = bytearray()  # what is appended to the newest revision, whatever that is by then
         self._ended = 0  # writes of this revision that have come to their end
-        self.single = False  # the revision before was one write
-        self.truncated = False  # this one began with a truncation: the close ends it
+        self._single = self._kept = False  # the revision before, through this descriptor, was one write; there was one
+        self.truncated = created and not append  # this one began with a truncation: the close ends it
         self.dirty = False
         self.idle = False  # an edge has passed since the last write
 
@@ -54,54 +54,93 @@ class Draft:
         """Begin a revision that holds what was there up to a size, zeros beyond its end."""
         if n_bytes > self._most:
             raise FsError(errno.EFBIG, f"{n_bytes} bytes, at most {self._most}")
+        if self._tail:
+            self.finish()
+        if n_bytes == 0 and self._ended:
+            self._end_before()
         data = self._begun() if n_bytes else bytearray()
         del data[n_bytes:]
         data.extend(bytes(n_bytes - len(data)))
-        self._data, self.truncated, self.dirty, self._ended = data, True, True, 0
+        self._data, self.truncated, self.dirty, self.idle, self._ended = data, True, True, False, 0
 
     def write(self, offset: int, piece: bytes) -> None:
         """Take a piece. At offset 0 a new revision begins, unless one has just begun, or the file appends."""
+        if not self.append:
+            self._check(offset + len(piece))
+        if not piece:
+            return
+        if self.append and self._data is None:
+            self._append(piece)
+            return
         if self.append:
             offset = len(self._begun())
-        elif offset == 0 and piece:
-            self._begin_anew()
-        data = self._begun()
-        if offset + len(piece) > self._most:
-            raise FsError(errno.EFBIG, f"{offset + len(piece)} bytes, at most {self._most}")
+        elif offset == 0 and self._data is not None and not (self.truncated and not self._data):
+            self._end_before()
+        data = self._begun() if offset or self._data is not None else bytearray()
+        if self.append:
+            self._check(offset + len(piece))
         if offset > len(data):
             data.extend(bytes(offset - len(data)))
         data[offset : offset + len(piece)] = piece
         self._data, self.dirty, self.idle = data, True, False
         if len(piece) < self._piece:
             self._ended += 1
-            if self.single and not self.truncated:
-                self.finish()
+            self._show(bytes(data))
 
-    def _begin_anew(self) -> None:
-        if self._data is not None and not (self.truncated and not self._data):
-            self.single = self._ended == 1
+    def _append(self, piece: bytes) -> None:
+        size = len(self._base()) + len(self._tail) + len(piece)
+        self._check(size)
+        self._tail += piece
+        self.dirty, self.idle = True, False
+        if len(piece) < self._piece and size <= SHOWN_AT_ONCE_BYTES:
             self.finish()
-            self.truncated = False
-        if self._data is None or not self.truncated:
-            self._data, self._ended = bytearray(), 0
+
+    def _check(self, n_bytes: int) -> None:
+        if n_bytes > self._most:
+            raise FsError(errno.EFBIG, f"{n_bytes} bytes, at most {self._most}")
+
+    def _show(self, data: bytes) -> None:
+        """Make a write that has ended a revision, if it is one."""
+        if self.truncated and not self._kept:
+            return
+        whole = self._is_whole(data)
+        if whole or (whole is None and self._single):
+            self.finish()
+
+    def _end_before(self) -> None:
+        """A new revision begins: the one before is finished. What was wrong with it is not the new one's fault."""
+        self._single, self._kept, self.truncated = self._ended == 1, True, False
+        with contextlib.suppress(RtdbError):
+            self.finish()
+        self._data, self._ended = bytearray(), 0
 
     def _begun(self) -> bytearray:
         return self._data if self._data is not None else bytearray(self._base())
 
     def finish(self) -> None:
         """Make what there is a revision, if there is anything new."""
-        if self.dirty and self._data is not None:
-            self.dirty = False
+        if not self.dirty:
+            return
+        self.dirty = False
+        if self._tail:
+            data, self._tail = self._base() + bytes(self._tail), bytearray()
+            self._commit(data)
+        elif self._data is not None:
             self._commit(bytes(self._data))
+
+    def sync(self) -> None:
+        """Make what there is a revision, and go on: a later close adds nothing by itself."""
+        self.truncated = False
+        self.finish()
 
     def edge(self) -> None:
         """Note an edge: what was begun without a truncation, and left alone for a whole cycle, counts as finished."""
-        if self.dirty and not self.truncated:
-            if self.idle:
+        if self.dirty and (self._kept or not self.truncated):
+            if self.idle or self._tail:
                 self.finish()
             self.idle = True
 
     @property
     def pristine(self) -> bool:
         """Whether nothing was begun."""
-        return self._data is None
+        return not self.dirty and not self._ended and not self._data

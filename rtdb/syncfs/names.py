@@ -1,6 +1,8 @@
 """Names of free files. They come and go at once; the store gets them as an object, for `/at` and for a successor.
 
-[[path, number, mode, uid, gid, mtime_ns, [objects of its content] or null for a directory], ...]
+[[number, number of its directory, name, mode, uid, gid, mtime_ns, [its objects] or null for a directory], ...]
+
+Each row is spelled once and kept until it changes.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -28,7 +30,8 @@ class Names:
         self._text = Content(self._spelled, sorted(self._spelled.numbers()))
         self.root = Root(tree, ROOT, None, "")
         self._last, self.count = FREE, 0
-        self._dirty, self._written_in = False, -1
+        self._rows: dict[int, bytes] = {}
+        self._dirty = False
         self._past: dict[int, FreeDir] = {}
         self._take_over()
 
@@ -37,14 +40,22 @@ class Names:
         self._last += 1
         return self._last
 
-    def changed(self) -> None:
-        """Note that names or contents changed: the store hears of it in this cycle or the next."""
-        self._dirty = True
-        if self._written_in != self._tree.store.cycle:
-            self._write()
+    def changed(self, *nodes: FreeFile | FreeDir) -> None:
+        """Note that these came, or are not what they were."""
+        for node in nodes:
+            if node.parent is not None:
+                numbers = node.data.numbers if isinstance(node, FreeFile) else None
+                row = [node.path, node.parent.path, node.name, node.mode, node.uid, node.gid, node.mtime_ns, numbers]
+                self._rows[node.path] = msgspec.json.encode(row)
+        self._write()
+
+    def removed(self, node: FreeFile | FreeDir) -> None:
+        """Note that it is gone."""
+        self._rows.pop(node.path, None)
+        self._write()
 
     def edge(self, cycle: int) -> None:
-        """Write what has changed since; go on with contents that waited for the edge."""
+        """Go on with what waited for the edge."""
         self.contents.edge(cycle)
         self._spelled.edge(cycle)
         self._past.clear()
@@ -52,53 +63,46 @@ class Names:
             self._write()
 
     def _write(self) -> None:
-        self._dirty, self._written_in = False, self._tree.store.cycle
-        rows: list[Any] = []
-        self._list(self.root, "", rows)
+        self._dirty = False
         try:
-            self._text.write(msgspec.json.encode(rows))
+            self._text.write(b"[" + b",".join(self._rows.values()) + b"]")
         except StoreFull:  # contents come first; `/at` and a successor see the names of before
             self._dirty = True
-
-    def _list(self, directory: FreeDir, path: str, rows: list[Any]) -> None:
-        for name, node in directory.children.items():
-            numbers = node.data.numbers if isinstance(node, FreeFile) else None
-            rows.append([path + name, node.path, node.mode, node.uid, node.gid, node.mtime_ns, numbers])
-            if isinstance(node, FreeDir):
-                self._list(node, f"{path}{name}/", rows)
 
     # -- back from the store --------------------------------------------------------------------------------------
 
     def _take_over(self) -> None:
-        """Go on with the files that a server before us left."""
+        """Go on with the files that a server before us left, also with what no edge has shown yet."""
         try:
-            text, _ = self._text.read(self._tree.store.cycle)
-            self._fill(self.root, text)
+            self._text.take_newest()
+            nodes = self._fill(self.root, self._text.newest)
+            for node in nodes:
+                if isinstance(node, FreeFile):
+                    node.data.take_newest()
         except (RtdbError, msgspec.DecodeError):  # damaged, or too old to be there: begin anew
             self.root.children.clear()
-        self.count = self._numbered(self.root)
+            nodes = []
+        self.count = len(nodes)
+        self._last = max([self._last, *(node.path for node in nodes)])
+        if nodes:
+            self.changed(*nodes)
 
-    def _numbered(self, directory: FreeDir) -> int:
-        count = 0
-        for node in directory.children.values():
-            self._last = max(self._last, node.path)
-            count += 1 + (self._numbered(node) if isinstance(node, FreeDir) else 0)
-        return count
-
-    def _fill(self, root: FreeDir, text: bytes) -> None:
-        for path, number, mode, uid, gid, mtime_ns, objects in msgspec.json.decode(text) if text else ():
-            directory: Any = root
-            *above, name = path.split("/")
-            for part in above:
-                directory = directory.children[part]
+    def _fill(self, root: FreeDir, text: bytes) -> list[FreeFile | FreeDir]:
+        """Make the nodes that a text tells of, below a root."""
+        nodes: dict[int, Any] = {root.path: root}
+        rows = msgspec.json.decode(text) if text else []
+        for number, _, name, mode, uid, gid, mtime_ns, objects in rows:
             node: FreeFile | FreeDir
             if objects is None:
-                node = FreeDir(self._tree, number, directory, name)
+                node = FreeDir(self._tree, number, root, name)
             else:
-                node = FreeFile(self._tree, number, directory, name, Content(self.contents, objects))
-                node.data.newest = node.data.read(self._tree.store.cycle)[0]
+                node = FreeFile(self._tree, number, root, name, Content(self.contents, objects))
             node.mode, node.uid, node.gid, node.mtime_ns = mode, uid, gid, mtime_ns
-            directory.children[name] = node
+            nodes[number] = node
+        for number, above, name, *_ in rows:  # a directory may stand behind what was moved into it
+            nodes[number].parent = nodes[above]
+            nodes[above].children[name] = nodes[number]
+        return [node for number, node in nodes.items() if number != root.path]
 
     def root_at(self, cycle: int) -> FreeDir:
         """Give the free files by the names that a cut shows."""

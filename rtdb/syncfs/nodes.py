@@ -57,7 +57,7 @@ class File(Node):
 
     __slots__ = ()
 
-    def content(self, cycle: int) -> bytes:
+    def content(self, cycle: int, who: Who) -> bytes:
         """Give what a cut shows."""
         raise NotImplementedError
 
@@ -72,6 +72,10 @@ class File(Node):
     def commit(self, data: bytes, who: Who) -> None:
         """Make this the next revision: it shows from the next edge on."""
         raise FsError(errno.EACCES, "it is read-only")
+
+    def is_whole(self, data: bytes) -> bool | None:
+        """Whether a content can be told to be complete; None where nothing tells."""
+        return None
 
     @property
     def most_bytes(self) -> int:
@@ -122,8 +126,8 @@ class ClockFile(File):
         """Give the pace that it keeps for who asks."""
         return self._pace or self.tree.pace_of(who.component)
 
-    def content(self, cycle: int) -> bytes:
-        return padded(self.tree.time_at(cycle, self._pace or self.tree.pace), CLOCK_BYTES)
+    def content(self, cycle: int, who: Who) -> bytes:
+        return padded(self.tree.time_at(cycle, self.pace_of(who)), CLOCK_BYTES)
 
 
 # -- components -------------------------------------------------------------------------------------------------------
@@ -145,7 +149,7 @@ class StatusFile(File):
             return self._attr(mode, len(text), cycle, written_ns or None)
         return self._attr(mode, view.size, cycle)
 
-    def content(self, cycle: int) -> bytes:
+    def content(self, cycle: int, who: Who) -> bytes:
         return self.tree.status_of(self.component).text(cycle)
 
     def check_write(self, who: Who) -> None:
@@ -156,9 +160,13 @@ class StatusFile(File):
         self.check_write(who)
         self.tree.seat_of(self.component).commit(data)
 
+    def is_whole(self, data: bytes) -> bool | None:
+        return is_json_object(data)
+
     @property
     def most_bytes(self) -> int:
-        return self.tree.limits.status_bytes
+        seat = self.tree.seats.get(self.component)
+        return self.tree.limits.status_bytes if seat is None else seat.spec.status_bytes
 
 
 class ConfigFile(File):
@@ -172,9 +180,9 @@ class ConfigFile(File):
 
     def attr(self, cycle: int, who: Who) -> Attr:
         mode = RW if who.may_wire(self.component) else R
-        return self._attr(mode, len(self.content(cycle)), cycle)
+        return self._attr(mode, len(self.content(cycle, who)), cycle)
 
-    def content(self, cycle: int) -> bytes:
+    def content(self, cycle: int, who: Who) -> bytes:
         raw = self.tree.store.core.visible(self.obj.handle, cycle)
         return b"" if raw is None else raw[0].rstrip(b"\0") + b"\n"
 
@@ -192,9 +200,21 @@ class ConfigFile(File):
             raise FsError(errno.EINVAL, str(error)) from error
         core.write(self.obj.handle, payload, core.not_before(self.obj.handle, core.now_ns), ())
 
+    def is_whole(self, data: bytes) -> bool | None:
+        return is_json_object(data)
+
     @property
     def most_bytes(self) -> int:
         return self.obj.size
+
+
+def is_json_object(data: bytes) -> bool:
+    """Whether a text is a JSON object."""
+    try:
+        json_payload(data, len(data))
+    except RecordError:
+        return False
+    return True
 
 
 class HealthFile(File):
@@ -209,7 +229,7 @@ class HealthFile(File):
     def attr(self, cycle: int, who: Who) -> Attr:
         return self._attr(R, HEALTH_BYTES, cycle)
 
-    def content(self, cycle: int) -> bytes:
+    def content(self, cycle: int, who: Who) -> bytes:
         sample = self.obj.visible(cycle)
         return padded({} if sample is None else sample.value, HEALTH_BYTES)
 
@@ -226,7 +246,7 @@ class PictureFile(File):
     def attr(self, cycle: int, who: Who) -> Attr:
         return self._attr(R, picture_size(self.field), cycle)
 
-    def content(self, cycle: int) -> bytes:
+    def content(self, cycle: int, who: Who) -> bytes:
         return picture(self.obj, self.field, cycle)
 
 
@@ -238,7 +258,7 @@ class ServerFile(File):
     def attr(self, cycle: int, who: Who) -> Attr:
         return self._attr(R, SERVER_BYTES, cycle)
 
-    def content(self, cycle: int) -> bytes:
+    def content(self, cycle: int, who: Who) -> bytes:
         return padded(self.tree.report(), SERVER_BYTES)
 
 
@@ -286,7 +306,7 @@ class FreeFile(File, Free):
         data, written_ns = self.data.read(cycle)
         return Attr(stat.S_IFREG | self.mode, len(data), max(self.mtime_ns, written_ns), cycle, self.uid, self.gid)
 
-    def content(self, cycle: int) -> bytes:
+    def content(self, cycle: int, who: Who) -> bytes:
         return self.data.read(cycle)[0]
 
     def check_write(self, who: Who) -> None:
@@ -297,8 +317,10 @@ class FreeFile(File, Free):
 
     def commit(self, data: bytes, who: Who) -> None:
         if not self.gone:  # removed while it was open: what is written goes with it
+            before = len(self.data.numbers)
             self.data.write(data)
-            self.tree.names.changed()
+            if len(self.data.numbers) != before:
+                self.tree.names.changed(self)
 
 
 class FreeDir(Directory, Free):

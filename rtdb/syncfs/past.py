@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from .nodes import CLOCK, Attr, Directory, File, Node
+from .nodes import Attr, Directory, File, Node
 from .policy import Who
 
 if TYPE_CHECKING:
@@ -41,8 +41,8 @@ class PastFile(File):
         attr = self._file.attr(self._at, Who())
         return attr._replace(mode=attr.mode & ~0o222)
 
-    def content(self, cycle: int) -> bytes:
-        return self._file.content(self._at)
+    def content(self, cycle: int, who: Who) -> bytes:
+        return self._file.content(self._at, Who())
 
 
 class PastDir(Directory):
@@ -60,17 +60,19 @@ class PastDir(Directory):
 
     def child(self, name: str, cycle: int) -> Node | None:
         found = self._dir.child(name, self._at)
-        return None if found is None else self._past(found)
+        return None if found is None else past_of(found, self._at, self)
 
     def entries(self, cycle: int) -> list[tuple[str, Node]]:
-        return [(name, self._past(node)) for name, node in self._dir.entries(self._at)]
+        return [(name, past_of(node, self._at, self)) for name, node in self._dir.entries(self._at)]
 
-    def _past(self, node: Node) -> Node:
-        number = HISTORY | (self._at & 0x7FFFFFF) << 36 | (node.path & 0xFFFFFFFFF)
-        if isinstance(node, Directory):
-            return PastDir(self.tree, number, self, node, self._at)
-        assert isinstance(node, File)
-        return PastFile(self.tree, number, self, node, self._at)
+
+def past_of(node: Node, at: int, parent: Directory) -> Node:
+    """Give a node as it was."""
+    number = HISTORY | (at & 0x7FFFFFF) << 36 | (node.path & 0xFFFFFFFFF)
+    if isinstance(node, Directory):
+        return PastDir(node.tree, number, parent, node, at)
+    assert isinstance(node, File)
+    return PastFile(node.tree, number, parent, node, at)
 
 
 class PastRoot(Directory):
@@ -82,18 +84,12 @@ class PastRoot(Directory):
         super().__init__(tree, path, parent)
         self.at, self.free_root = at, tree.names.root_at(at)
 
-    def _dir(self) -> PastDir:
-        return PastDir(self.tree, self.path, self.parent or self, self.free_root, self.at)
-
     def child(self, name: str, cycle: int) -> Node | None:
-        if name == "clock":
-            return PastFile(self.tree, self.path | CLOCK, self, self.tree.clock, self.at)
-        component = self.tree.component_dir(name)
-        if component is not None:
-            return PastDir(self.tree, self.path | component.path, self, component, self.at)
-        return self._dir().child(name, cycle)
+        found: Node | None = self.tree.clock if name == "clock" else self.tree.component_dir(name)
+        found = found or self.free_root.child(name, self.at)
+        return None if found is None else past_of(found, self.at, self)
 
     def entries(self, cycle: int) -> list[tuple[str, Node]]:
-        names = ["clock", *self.tree.component_dirs()]
-        fixed = [(name, node) for name in names if (node := self.child(name, cycle)) is not None]
-        return [*fixed, *(e for e in self._dir().entries(cycle) if e[0] not in names)]
+        there: dict[str, Node] = {**dict(self.free_root.entries(self.at)), "clock": self.tree.clock}
+        there |= self.tree.component_dirs()
+        return [(name, past_of(node, self.at, self)) for name, node in there.items()]

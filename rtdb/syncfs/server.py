@@ -25,6 +25,7 @@ from .session import Session
 
 log = logging.getLogger(__name__)
 LOOK_S = 0.25  # between looks at what stands still
+BATCH = 64  # messages of one client that are answered in a row
 _CREDENTIALS = struct.Struct("3i")
 
 
@@ -110,6 +111,10 @@ class FileServer:
                     with contextlib.suppress(RuntimeError):  # the loop has ended
                         self._loop.call_soon_threadsafe(self._edge)
 
+    def soon(self, call: Callable[[], None]) -> None:
+        """Have something done in the loop's next round."""
+        self._loop.call_soon(call)
+
     def _edge(self) -> None:
         self._told = False
         if not self._stop.is_set():
@@ -157,11 +162,20 @@ class Connection(asyncio.Protocol):
         """Answer what came. Linux' client has no TCP_NODELAY: without quick acknowledgement its next request waits."""
         if self._quick is not None:
             self._quick(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-        session = self.session
-        if session is not None:
-            session.feed(data)
-            if session.over:
-                self.close()
+        if self.session is not None:
+            self._after(self.session.feed(data, BATCH))
+
+    def _go_on(self) -> None:
+        if self.session is not None and not self.session.over:
+            self._after(self.session.go_on(BATCH))
+
+    def _after(self, more: bool) -> None:
+        """Let others have their turn before this client's next batch."""
+        assert self.session is not None
+        if self.session.over:
+            self.close()
+        elif more:
+            self._server.soon(self._go_on)
 
     def pause_writing(self) -> None:
         """The client does not take its replies: it is not listened to until it does."""
@@ -174,9 +188,7 @@ class Connection(asyncio.Protocol):
         if self.session is not None and self._transport is not None:
             self.session.paused = False
             self._transport.resume_reading()
-            self.session.go_on()
-            if self.session.over:
-                self.close()
+            self._server.soon(self._go_on)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Everything that the connection held goes."""

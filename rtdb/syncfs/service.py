@@ -64,6 +64,7 @@ class Service:
         if cycle == self.cycle:
             return
         self._edges, self._skipped = self._edges + 1, self._skipped + cycle - self.cycle - 1
+        is_edge = self.tree.pace.last(cycle) != self.tree.pace.last(self.cycle)
         self.cycle, self._edge_s = cycle, now_s
         edge_ns, waited = self.store.t0_ns + cycle * self.store.tick_ns, len(self.waiting)
         if self._real:
@@ -72,13 +73,16 @@ class Service:
         if self._real and len(self.waiting) < waited:
             _count(self._answered_us, self.store.now_ns - edge_ns)
         self.tree.edge(cycle)
-        for session in self.sessions:
+        for session in self.sessions if is_edge else ():
             session.edge()
 
     def look(self, now_s: float) -> None:
         """Look at what stands still, by the host's clock."""
-        if len(self.waiting) and now_s - self._edge_s > self._grace_s:
-            self.waiting.stopped(self.store.cycle, now_s - self._grace_s, clock_alive=self.store.clock.alive)
+        clock = self.store.clock
+        slow_s = 2e-9 * self.tree.pace.every * clock.tick_ns if self._real else 0.0
+        grace_s = max(self._grace_s, slow_s)
+        if len(self.waiting) and now_s - self._edge_s > grace_s:
+            self.waiting.stopped(self.store.cycle, now_s - grace_s, participants=self._real or not clock.alive)
         for seat in self.tree.seats.values():
             seat.idle(now_s)
 
@@ -93,6 +97,7 @@ class Service:
             "edges_skipped": self._skipped,
             "heard_us": self._heard_us,
             "answered_us": self._answered_us,
+            "missed_by_connection": [session.missed for session in self.sessions][:64],
             "missed": {name: seat.missed for name, seat in self.tree.seats.items()},
             "refused": {name: seat.refused for name, seat in self.tree.seats.items() if seat.refused},
         }

@@ -4,6 +4,7 @@ One handler per message, guards first. A handler returns the reply, raises what 
 or returns None for a stat of a clock, which is answered at the next edge. Replies may overtake each other.
 """
 
+import contextlib
 import errno
 import logging
 import stat
@@ -33,6 +34,7 @@ from .draft import Draft
 from .errors import FsError, errno_of, text_of
 from .nodes import Attr, ClockFile, Directory, File, FreeDir, FreeFile, Node
 from .pace import Pace
+from .past import PastRoot
 from .policy import Tokens, Who
 from .seats import Seat
 from .tree import Tree
@@ -46,7 +48,7 @@ DMDIR, DMAPPEND = 0x80000000, 0x40000000
 SPECIAL = 0x02000000 | 0x00800000 | 0x00200000 | 0x00100000  # symlink, device, fifo, socket
 SET_MODE, SET_UID, SET_GID, SET_SIZE, SET_MTIME, SET_MTIME_TO = 0x1, 0x2, 0x4, 0x8, 0x20, 0x100
 V9FS_MAGIC, BLOCK, AT_REMOVEDIR = 0x01021997, 4096, 0x200
-KEEP = 0xFFFFFFFF  # of a wstat: leave it
+KEEP, KEEP_LENGTH = 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF  # of a wstat: leave it
 _ENTRY = struct.Struct("<BIQQB")
 _STAT = struct.Struct("<HIBIQIIIQ")
 
@@ -87,19 +89,21 @@ class Session:
         self.over = False  # the connection is to be closed
         self.paused = False  # the client does not take its replies: nothing more is answered
         self.requests = 0
+        self.missed = 0  # edges at which nobody waited who had waited for one before
+        self._woken: dict[Pace, int] = {}
         self._handlers = self._make_handlers()
 
     # -- bytes ----------------------------------------------------------------------------------------------------
 
-    def feed(self, data: bytes) -> None:
-        """Take bytes as they came."""
+    def feed(self, data: bytes, at_most: int = 1 << 30) -> bool:
+        """Take bytes as they came, and answer; see go_on."""
         self._buffer += data
-        self.go_on()
+        return self.go_on(at_most)
 
-    def go_on(self) -> None:
-        """Answer what has come, as long as replies are taken."""
-        buffer, at = self._buffer, 0
-        while not self.paused and not self.over and len(buffer) - at >= HEADER.size:
+    def go_on(self, at_most: int = 1 << 30) -> bool:
+        """Answer so many messages, as long as replies are taken; says whether there may be more."""
+        buffer, at, last = self._buffer, 0, self.requests + at_most
+        while not self.paused and not self.over and self.requests < last and len(buffer) - at >= HEADER.size:
             size = HEADER.unpack_from(buffer, at)[0]
             if size < HEADER.size or size > self._msize:
                 self._end(f"a message of {size} bytes, {HEADER.size} to {self._msize} are agreed upon")
@@ -110,6 +114,7 @@ class Session:
             at += size
         if at:
             del buffer[:at]
+        return self.requests == last
 
     def _end(self, why: str) -> None:
         log.warning("a connection is closed: %s", why)
@@ -197,8 +202,19 @@ class Session:
         """Give the cut that a mount sees: that of its last edge."""
         return fid.pace.last(self._core.cycle)
 
-    def _qid(self, node: Node, cycle: int) -> Qid:
-        return Qid(DIR if node.is_dir else FILE, cycle & 0xFFFFFFFF, node.path)
+    def _shown(self, fid: Fid) -> int:
+        """Give the cut that a file shows: a clock's own edge, else that of the mount."""
+        pace = fid.node.pace_of(fid.who) if isinstance(fid.node, ClockFile) else fid.pace
+        return pace.last(self._core.cycle)
+
+    def _qid(self, node: Node, fid: Fid) -> Qid:
+        cycle = self._core.cycle
+        if isinstance(node, ClockFile):
+            pace = node.pace_of(fid.who)
+            version = pace.count(pace.last(cycle))
+        else:
+            version = fid.pace.last(cycle)
+        return Qid(DIR if node.is_dir else FILE, version & 0xFFFFFFFF, node.path)
 
     def _drop(self, number: int) -> None:
         """Clunk: the draft is finished, the fid is gone whatever comes of it."""
@@ -228,10 +244,15 @@ class Session:
         if aname not in ("", "/") and who.component is None and not who.operator:
             raise FsError(errno.EACCES, "aname is no token of this server")
         tree = self._tree
+        new = Fid(tree.root, who, tree.pace_of(who.component))
+        self._new_fid(fid, new)
         if who.component is not None:
-            tree.seat_of(who.component).sit(self)
-        self._new_fid(fid, Fid(tree.root, who, tree.pace_of(who.component)))
-        return self._reply("Rattach", tag, self._qid(tree.root, 0))
+            try:
+                tree.seat_of(who.component).sit(self)
+            except RtdbError:
+                del self._fids[fid]
+                raise
+        return self._reply("Rattach", tag, self._qid(tree.root, new))
 
     def _flush(self, tag: int, oldtag: int) -> bytes:
         if oldtag in self._held:
@@ -243,7 +264,7 @@ class Session:
         fid = self._fid(number)
         if newfid != number and newfid in self._fids:
             raise FsError(errno.EBADF, f"fid {newfid} is in use")
-        if names and fid.opened is not None:
+        if (names or newfid == number) and fid.opened is not None:
             raise FsError(errno.EINVAL, "this fid is open")
         node, cycle = fid.node, self._cycle(fid)
         qids: list[Qid] = []
@@ -254,7 +275,7 @@ class Session:
                 if not qids:
                     raise
                 return self._reply("Rwalk", tag, qids)
-            qids.append(self._qid(node, cycle))
+            qids.append(self._qid(node, fid))
         new = Fid(node, fid.who, fid.pace)
         if newfid == number:
             self._fids[number] = new
@@ -280,16 +301,18 @@ class Session:
         count = min(count, self._msize - IO_HEADER)
         node = fid.node
         if isinstance(node, Directory):
+            if self._dialect is LINUX:
+                raise FsError(errno.EISDIR)
             return self._reply("Rread", tag, self._stats_of(fid, node, offset, count))
         data = fid.pinned
         if offset == 0 or data is None:
             assert isinstance(node, File)
-            data = fid.pinned = self._tree.read(node, fid.pace.last(self._core.cycle))
+            data = fid.pinned = self._tree.read(node, self._shown(fid), fid.who)
         return self._reply("Rread", tag, data[offset : offset + count])
 
     def _write(self, tag: int, number: int, offset: int, data: bytes) -> bytes:
         fid = self._fid(number)
-        if fid.draft is None:
+        if fid.draft is None or fid.opened == OREAD:
             raise FsError(errno.EBADF, "this fid is not open for writing")
         assert isinstance(fid.node, File)
         self._tree.room_for(fid.node, len(data) if fid.draft.append else offset + len(data))
@@ -317,7 +340,7 @@ class Session:
 
     # -- opening and creating -------------------------------------------------------------------------------------
 
-    def _open_fid(self, fid: Fid, access: int, *, append: bool, truncate: bool) -> None:
+    def _open_fid(self, fid: Fid, access: int, *, append: bool, truncate: bool, created: bool = False) -> None:
         if fid.opened is not None:
             raise FsError(errno.EBADF, "this fid is open")
         node = fid.node
@@ -332,6 +355,8 @@ class Session:
                 append=append,
                 most_bytes=node.most_bytes,
                 piece_bytes=self._msize - IO_HEADER,
+                is_whole=node.is_whole,
+                created=created,
             )
             self._writing[fid] = None
             if truncate:
@@ -347,7 +372,7 @@ class Session:
         fresh = found or self._tree.create(fid.node, name, mode, fid.who, gid)
         directory, fid.node = fid.node, fresh
         try:
-            self._open_fid(fid, flags[0], append=flags[1], truncate=False)
+            self._open_fid(fid, flags[0], append=flags[1], truncate=False, created=found is None)
         except RtdbError:
             fid.node = directory
             raise
@@ -359,20 +384,20 @@ class Session:
             raise FsError(errno.ENOTDIR)
         truncate = bool(flags & O_TRUNC) and flags & O_ACCESS != OREAD
         self._open_fid(fid, flags & O_ACCESS, append=bool(flags & O_APPEND), truncate=truncate)
-        return self._reply("Rlopen", tag, self._qid(fid.node, self._cycle(fid)), 0)
+        return self._reply("Rlopen", tag, self._qid(fid.node, fid), 0)
 
     def _lcreate(self, tag: int, number: int, name: str, flags: int, mode: int, gid: int) -> bytes:
         fid = self._fid(number)
         how = flags & O_ACCESS, bool(flags & O_APPEND)
         node = self._create(fid, name, mode, gid, how, exclusive=bool(flags & O_EXCL))
-        return self._reply("Rlcreate", tag, self._qid(node, self._cycle(fid)), 0)
+        return self._reply("Rlcreate", tag, self._qid(node, fid), 0)
 
     def _open(self, tag: int, number: int, mode: int) -> bytes:
         fid = self._fid(number)
         access = OREAD if mode & 3 == OEXEC else mode & 3
         truncate = bool(mode & OTRUNC) and not fid.node.is_dir
         self._open_fid(fid, access, append=bool(mode & OAPPEND), truncate=truncate)
-        return self._reply("Ropen", tag, self._qid(fid.node, self._cycle(fid)), 0)
+        return self._reply("Ropen", tag, self._qid(fid.node, fid), 0)
 
     def _tcreate(self, tag: int, number: int, name: str, perm: int, mode: int, _extension: str = "") -> bytes:
         fid = self._fid(number)
@@ -388,7 +413,7 @@ class Session:
             access = OREAD if mode & 3 == OEXEC else mode & 3
             append = bool(mode & OAPPEND or perm & DMAPPEND)
             node = self._create(fid, name, perm, 0, (access, append), exclusive=True)
-        return self._reply("Rcreate", tag, self._qid(node, self._cycle(fid)), 0)
+        return self._reply("Rcreate", tag, self._qid(node, fid), 0)
 
     # -- what a stat tells ----------------------------------------------------------------------------------------
 
@@ -400,8 +425,7 @@ class Session:
         return self._attributes(tag, fid)
 
     def _attributes(self, tag: int, fid: Fid) -> bytes:
-        cycle = self._cycle(fid)
-        attr = fid.node.attr(cycle, fid.who)
+        attr = fid.node.attr(self._shown(fid), fid.who)
         s, ns = divmod(attr.mtime_ns, 1_000_000_000)
         blocks = (attr.size + 511) // 512
         return self._reply(
@@ -422,11 +446,16 @@ class Session:
             seat = self._tree.seat_of(clock.component)
             for other in self._writing:  # what it keeps open is finished, too
                 if other.draft is not None and not other.draft.truncated:
-                    other.draft.finish()
+                    with contextlib.suppress(RtdbError):  # the component's health says so
+                        other.draft.finish()
         asked = pace.last(self._core.cycle)
+        woken = self._woken.get(pace)
+        if woken is not None and asked > woken:
+            self.missed += (asked - woken) // pace.every
 
         def answer() -> None:
             del self._held[tag]
+            self._woken[pace] = pace.last(self._core.cycle)
             try:
                 reply = made()
             except RtdbError as error:
@@ -489,13 +518,16 @@ class Session:
         cycle = self._cycle(fid)
         if offset == 0 or not isinstance(fid.listing, list):
             fid.listing = [(".", node), ("..", node.parent or node), *node.entries(cycle)]
-        count, out, size = min(count, self._msize - IO_HEADER), [], 0
+        count, size = min(count, self._msize - IO_HEADER), 0
+        out: list[bytes] = []
         for k in range(offset, len(fid.listing)):
             name, entry = fid.listing[k]
             kind = (DIR, 4) if entry.is_dir else (FILE, 8)
             row = _ENTRY.pack(kind[0], cycle & 0xFFFFFFFF, entry.path, k + 1, kind[1]) + encoded_text(name)
             size += len(row)
             if size > count:
+                if not out:
+                    raise FsError(errno.EINVAL, "no room for one entry")
                 break
             out.append(row)
         return self._reply("Rreaddir", tag, b"".join(out))
@@ -530,7 +562,7 @@ class Session:
         fid = self._fid(number)
 
         def made() -> bytes:
-            attr = fid.node.attr(self._cycle(fid), fid.who)
+            attr = fid.node.attr(self._shown(fid), fid.who)
             return self._reply("Rstat", tag, self._stat_bytes(fid.node, self._name_of(fid.node), attr))
 
         if isinstance(fid.node, ClockFile):
@@ -541,8 +573,10 @@ class Session:
     def _name_of(self, node: Node) -> str:
         if isinstance(node, FreeFile | FreeDir):
             return node.name or "/"
-        if node.parent is None:
+        if node.parent is None or node.parent is node:
             return "/"
+        if isinstance(node, PastRoot):
+            return str(node.at)
         return next((name for name, other in node.parent.entries(0) if other.path == node.path), "/")
 
     def _wstat(self, tag: int, number: int, record: bytes) -> bytes:
@@ -557,7 +591,7 @@ class Session:
         if self._dialect is UNIX:
             (n,) = struct.unpack_from("<H", record, at)
             uid, gid, _ = struct.unpack_from("<III", record, at + 2 + n)
-        if length != 0xFFFFFFFFFFFFFFFF:
+        if length != KEEP_LENGTH:
             self._truncate(fid, length)
         if mode != KEEP or mtime != KEEP or uid != KEEP or gid != KEEP:
             self._tree.set_attr(
@@ -565,8 +599,10 @@ class Session:
                 mode=None if mode == KEEP else mode & 0o777,
                 uid=None if uid == KEEP else uid,
                 gid=None if gid == KEEP else gid,
-                mtime_ns=None if mtime == KEEP or length != 0xFFFFFFFFFFFFFFFF else mtime * 1_000_000_000,
+                mtime_ns=None if mtime == KEEP or length != KEEP_LENGTH else mtime * 1_000_000_000,
             )
+        if fid.draft is not None and not texts[0] and {mode, mtime, uid, gid} == {KEEP} and length == KEEP_LENGTH:
+            fid.draft.sync()  # a wstat that changes nothing is an fsync
         name = texts[0]
         if name and name != self._name_of(fid.node):
             self._rename_node(fid.node, fid.node.parent, name.rpartition("/")[2])
@@ -598,7 +634,7 @@ class Session:
         if not isinstance(fid.node, Directory):
             raise FsError(errno.ENOTDIR)
         node = self._tree.mkdir(fid.node, name, mode, fid.who, gid)
-        return self._reply("Rmkdir", tag, self._qid(node, self._cycle(fid)))
+        return self._reply("Rmkdir", tag, self._qid(node, fid))
 
     def _unlinkat(self, tag: int, number: int, name: str, flags: int) -> bytes:
         fid = self._fid(number)
@@ -621,8 +657,7 @@ class Session:
     def _fsync(self, tag: int, number: int, _datasync: int) -> bytes:
         fid = self._fid(number)
         if fid.draft is not None:
-            fid.draft.finish()
-            fid.draft.truncated = False
+            fid.draft.sync()
         return self._reply("Rfsync", tag)
 
     def _lock(self, tag: int, number: int, *_what: Any) -> bytes:

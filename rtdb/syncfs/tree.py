@@ -229,20 +229,27 @@ class Tree:
             raise FsError(errno.EEXIST, f"{name} is there already")
         if self.names.count >= self.limits.files:
             raise FsError(errno.ENOSPC, f"{self.names.count} files, and there may be no more")
-        depth, at = 1, directory
+        self._check_depth(directory, 1)
+        return directory
+
+    def _check_depth(self, directory: FreeDir, below: int) -> None:
+        """Refuse what would lie too deep, or in a directory that was removed."""
+        depth, at = below, directory
         while at is not self.root:
-            if at.parent is None or at.name not in getattr(at.parent, "children", {}):
+            above = at.parent
+            if not isinstance(above, FreeDir) or above.children.get(at.name) is not at:
                 raise FsError(errno.ENOENT, "this directory was removed")
-            depth, at = depth + 1, at.parent  # type: ignore[assignment]
+            depth, at = depth + 1, above
         if depth > self.limits.depth:
             raise FsError(errno.ENAMETOOLONG, f"{depth} directories in each other, at most {self.limits.depth}")
-        return directory
 
     def check_name(self, name: str) -> None:
         """Refuse what is no name."""
         if not name or name in (".", "..") or "/" in name or "\0" in name:
             raise FsError(errno.EINVAL, f"{name!r} is no name")
-        if len(name.encode(errors="surrogateescape")) > self.limits.name_bytes:
+        if any("\ud800" <= c <= "\udfff" for c in name):
+            raise FsError(errno.EILSEQ, "a name is UTF-8")
+        if len(name.encode()) > self.limits.name_bytes:
             raise FsError(errno.ENAMETOOLONG, f"a name has at most {self.limits.name_bytes} bytes")
 
     def create(self, directory: Directory, name: str, mode: int, who: Who, gid: int = 0) -> FreeFile:
@@ -268,7 +275,7 @@ class Tree:
         parent.children[node.name] = node
         parent.mtime_ns = node.mtime_ns
         self.names.count += 1
-        self.names.changed()
+        self.names.changed(node)
 
     def _edge_ns(self) -> int:
         return self.store.t0_ns + self.store.cycle * self.store.tick_ns
@@ -297,7 +304,7 @@ class Tree:
         del parent.children[name]
         self._gone(node)
         parent.mtime_ns = self._edge_ns()
-        self.names.changed()
+        self.names.removed(node)
 
     def _gone(self, node: FreeFile | FreeDir) -> None:
         self.names.count -= 1
@@ -314,6 +321,7 @@ class Tree:
             raise FsError(errno.EACCES, f"{new} belongs to the store")
         if not isinstance(to, FreeDir):
             raise FsError(errno.EACCES, "nobody makes files here")
+        self._check_depth(to, _height(node))
         at: Any = to
         while at is not self.root:
             if at is node:
@@ -330,7 +338,7 @@ class Tree:
         node.name, node.parent = new, to
         to.children[new] = node
         parent.mtime_ns = to.mtime_ns = self._edge_ns()
-        self.names.changed()
+        self.names.changed(node)
 
     def set_attr(self, node: Node, *, mode: int | None, uid: int | None, gid: int | None, mtime_ns: int | None) -> None:
         """Change what users see of a free file."""
@@ -344,7 +352,7 @@ class Tree:
         node.uid = node.uid if uid is None else uid
         node.gid = node.gid if gid is None else gid
         node.mtime_ns = node.mtime_ns if mtime_ns is None else mtime_ns
-        self.names.changed()
+        self.names.changed(node)
 
     def room_for(self, file: File, n_bytes: int) -> None:
         """Refuse a revision for which there is no room, while somebody still listens."""
@@ -353,11 +361,16 @@ class Tree:
         if isinstance(file, FreeFile) and not file.gone:
             rooms = file.data.rooms
             if (not rooms or n_bytes > rooms[-1]) and not self.names.contents.fits(n_bytes):
-                raise FsError(errno.ENOSPC, "the store has no room left for this")
+                file.data.grow(n_bytes)  # deleted files may make room, which only an insert finds out
 
-    def read(self, file: File, cycle: int) -> bytes:
+    def read(self, file: File, cycle: int, who: Who) -> bytes:
         """Give a file's content in a cut; ESTALE where the store does not reach back so far."""
         try:
-            return file.content(cycle)
+            return file.content(cycle, who)
         except AgedOut as error:
             raise FsError(errno.ESTALE, "the store's history does not reach back so far") from error
+
+
+def _height(node: FreeFile | FreeDir) -> int:
+    """Give how many levels a node and what lies in it take."""
+    return 1 + max((_height(child) for child in node.children.values()), default=0) if isinstance(node, FreeDir) else 1

@@ -45,16 +45,16 @@ class Waiting:
             if not waiters:
                 del self._of[pace]
 
-    def stopped(self, cycle: int, before_s: float, *, clock_alive: bool) -> None:
+    def stopped(self, cycle: int, before_s: float, *, participants: bool) -> None:
         """Answer those that came before a time, of a clock that stands.
 
-        Who takes part in a barrier would do its cycle again: it is answered only if nobody holds the clock.
+        participants: also those that wait for their own clock, and will do their cycle again.
         """
         for waiters in list(self._of.values()):
             due = [
                 (key, waiter)
                 for key, waiter in waiters.items()
-                if waiter.since_s < before_s and (waiter.seat is None or not clock_alive)
+                if waiter.since_s < before_s and (waiter.seat is None or participants)
             ]
             self._release(waiters, due, cycle)
 
