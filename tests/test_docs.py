@@ -16,6 +16,7 @@ the document; `?` there asks for a sentence.
 import inspect
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -79,7 +80,8 @@ class Session:
 
     def command(self, line: str, number: int) -> None:
         text, _, comment = line.partition(" #")
-        words = re.sub(r"(--db[ =]\S+|^fairway wire \S+)", rf"\1-{os.getpid()}", text).split()
+        named = re.sub(r"(--db[ =]\S+|^fairway wire \S+)", rf"\1-{os.getpid()}", text)
+        words = shlex.split(named)
         stated = re.search(r"exit (\d+)", comment)
         expected = int(stated[1]) if stated else 0
         argv = [sys.executable, "-m", "scenarios.cli", *words[1:]]
@@ -88,7 +90,8 @@ class Session:
                 argv, cwd=self.folder, env=self.env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
             )
             self.running.append((f"{self.page.name}:{number}: {line}", expected, process))
-            self.wait_for_store(words[words.index("--db") + 1], process)
+            if "--db" in words:
+                self.wait_for_store(words[words.index("--db") + 1], process)
             return
         done = subprocess.run(
             argv, cwd=self.folder, env=self.env, text=True, capture_output=True, timeout=TIMEOUT_S, check=False

@@ -21,6 +21,7 @@ At = Annotated[str | None, typer.Option("--at", help="Address of its server. Def
 TokenOption = Annotated[
     str, typer.Option("--token", envvar="FAIRWAY_TOKEN", help="To be a component, or the operator.")
 ]
+Wait = Annotated[float, typer.Option("--wait", help="Seconds to wait for the server.", min=0.0)]
 FilePath = Annotated[str, typer.Argument(metavar="PATH", help="Such as /localise/status.")]
 
 
@@ -174,11 +175,22 @@ def invitation(addresses: "list[Address]", tokens: "Tokens") -> list[str]:
 # -- without a mount --------------------------------------------------------------------------------------------------
 
 
-def _client(db: str, at: str | None, token: str) -> "Client":
+def _client(db: str, at: str | None, token: str, wait_s: float) -> "Client":
+    import errno
+    import time
+
     from .addresses import default_address
     from .client import Client
+    from .errors import FsError
 
-    return Client.connect(at if at is not None else default_address(db), token)
+    deadline_s = time.monotonic() + wait_s
+    while True:
+        try:
+            return Client.connect(at if at is not None else default_address(db), token)
+        except FsError as error:
+            if error.errno not in (errno.ENOENT, errno.ECONNREFUSED) or time.monotonic() > deadline_s:
+                raise
+            time.sleep(0.05)  # there is nothing to wait on yet
 
 
 @app.command(
@@ -186,9 +198,9 @@ def _client(db: str, at: str | None, token: str) -> "Client":
         "fairway fs stat /clock          (waits for the next edge)", "fairway fs stat /follow/clock --token TOKEN"
     )
 )
-def stat(path: FilePath, db: Db = "cart", at: At = None, token: TokenOption = "") -> None:
+def stat(path: FilePath, db: Db = "cart", at: At = None, token: TokenOption = "", wait: Wait = 0.0) -> None:
     """Show what a file is; a clock is shown at its next edge."""
-    with _client(db, at, token) as client:
+    with _client(db, at, token, wait) as client:
         typer.echo(stat_line(path, client))
 
 
@@ -206,9 +218,10 @@ def cat(
     db: Db = "cart",
     at: At = None,
     token: TokenOption = "",
+    wait: Wait = 0.0,
 ) -> None:
     """Print files: one revision of each."""
-    with _client(db, at, token) as client:
+    with _client(db, at, token, wait) as client:
         for path in paths:
             sys.stdout.buffer.write(client.read(path))
             sys.stdout.buffer.flush()
@@ -220,10 +233,11 @@ def ls(
     db: Db = "cart",
     at: At = None,
     token: TokenOption = "",
+    wait: Wait = 0.0,
     long: Annotated[bool, typer.Option("-l", help="With sizes. Clocks are left out: asking them would wait.")] = False,
 ) -> None:
     """List a directory."""
-    with _client(db, at, token) as client:
+    with _client(db, at, token, wait) as client:
         for name in client.ls(path):
             if long and name != "clock":
                 typer.echo(stat_line(f"{path.rstrip('/')}/{name}", client))
@@ -242,17 +256,18 @@ def write(
     db: Db = "cart",
     at: At = None,
     token: TokenOption = "",
+    wait: Wait = 0.0,
 ) -> None:
     """Write a whole file, as one revision; it shows from the next edge on."""
     data = sys.stdin.buffer.read() if text is None else (text + "\n").encode()
-    with _client(db, at, token) as client:
+    with _client(db, at, token, wait) as client:
         client.write(path, data)
 
 
 @app.command(
     epilog=examples("coproc FS { fairway fs lines --token TOKEN; }     (in bash; then: echo wait /clock >&${FS[1]})")
 )
-def lines(db: Db = "cart", at: At = None, token: TokenOption = "") -> None:
+def lines(db: Db = "cart", at: At = None, token: TokenOption = "", wait: Wait = 0.0) -> None:
     """Do what each line of standard input says, and answer with one line: for scripts that have no mount.
 
     wait CLOCK: number of its next edge; cat PATH: the file, as one line; write PATH TEXT: ok; ls PATH: names; bye.
@@ -260,7 +275,7 @@ def lines(db: Db = "cart", at: At = None, token: TokenOption = "") -> None:
     """
     from ..errors import RtdbError
 
-    with _client(db, at, token) as client:
+    with _client(db, at, token, wait) as client:
         for line in sys.stdin:
             verb, _, rest = line.strip().partition(" ")
             if verb in ("", "bye"):

@@ -140,12 +140,14 @@ class Client:
         else:
             try:
                 self._call("Tlopen", fid, O_WRONLY | O_TRUNC)
-            except FsError:
+            except FsError as error:
                 self._clunk(fid)
-                raise
+                raise _at(path, error) from error
         try:
             self._put(fid, data)
             self._call("Tfsync", fid, 0)  # says what is wrong with it; a close cannot
+        except FsError as error:
+            raise _at(path, error) from error
         finally:
             self._clunk(fid)
 
@@ -240,7 +242,7 @@ class Client:
                 self._call("Tclunk", fid)
             if error.errno == errno.ENOENT and done >= len(names) - 1:
                 return None
-            raise FsError(error.errno or errno.EIO, f"{path}: {os.strerror(error.errno or errno.EIO)}") from error
+            raise _at(path, error) from error
 
     def _kept(self, path: str, access: int) -> int:
         fid = self._open.get((path, access))
@@ -251,7 +253,7 @@ class Client:
                     self._call("Tlopen", fid, access)
                 except FsError as error:
                     self._clunk(fid)
-                    raise FsError(error.errno or errno.EIO, f"{path}: {error}") from error
+                    raise _at(path, error) from error
             self._open[path, access] = fid
         return fid
 
@@ -296,3 +298,11 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _at(path: str, error: FsError) -> FsError:
+    """Say which file an error is about; where JSON is refused, also where it says why."""
+    code = error.errno or errno.EIO
+    folder, _, name = path.rpartition("/")
+    more = f"; {folder}/health says why" if code == errno.EINVAL and name in ("status", "config") else ""
+    return FsError(code, f"{path}: {os.strerror(code)}{more}")

@@ -45,7 +45,8 @@ def drive(tmp_path: Path, guest: rig.Guest) -> Iterator[Callable[[str], dict[str
 
     yield run
     process.kill()
-    process.communicate()
+    process.wait()
+    process.stderr.close()
 
 
 def test_a_shell_script_steers_the_cart_around_the_square(
