@@ -43,19 +43,24 @@ class Stat(NamedTuple):
 class Client:
     """A connection to a file server. Use it in a `with`, or close it."""
 
-    def __init__(self, sock: socket.socket, token: str = "") -> None:
+    def __init__(self, sock: socket.socket, token: str = "", msize: int = MSIZE) -> None:
         self._sock, self._buffer = sock, b""
         self._free, self._last = list[int](), ROOT
         self._open: dict[tuple[str, int], int] = {}  # fids of files that stay open
-        msize, version = self._call("Tversion", MSIZE, LINUX.name, tag=NOTAG)
+        msize, version = self._call("Tversion", msize, LINUX.name, tag=NOTAG)
         if version != LINUX.name:
             raise FsError(errno.EPROTO, f"the server speaks {version}, not {LINUX.name}")
         self._piece = msize - IO_HEADER
         self._call("Tattach", ROOT, NOFID, "", token, NO_UID)
 
     @classmethod
-    def connect(cls, address: Address | str, token: str = "", timeout_s: float | None = None) -> Self:
-        """Connect; FsError where nobody listens. timeout_s: for each call [a stat of a clock may take long]."""
+    def connect(
+        cls, address: Address | str, token: str = "", timeout_s: float | None = None, msize: int = MSIZE
+    ) -> Self:
+        """Connect; FsError where nobody listens.
+
+        timeout_s: for each call [a stat of a clock may take long]; msize: largest message, bytes.
+        """
         where = Address.parse(address) if isinstance(address, str) else address
         sock = socket.socket(socket.AF_UNIX if where.path is not None else socket.AF_INET)
         try:
@@ -63,7 +68,7 @@ class Client:
             sock.connect(str(where.path) if where.path is not None else (where.host, where.port))
             if where.path is None:
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            return cls(sock, token)
+            return cls(sock, token, msize)
         except OSError as error:
             sock.close()
             if isinstance(error, FsError):

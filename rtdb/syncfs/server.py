@@ -248,7 +248,7 @@ def run(
     """Serve until SIGINT or SIGTERM, or until a future is done. plain: without uvloop."""
     import signal
 
-    sys.setswitchinterval(0.0005)  # the thread that hears the edges must not wait for a slice of 5 ms
+    sys.setswitchinterval(0.0005)  # the thread that hears of edges waits for no slice of 5 ms
 
     async def serve() -> None:
         loop = asyncio.get_running_loop()
