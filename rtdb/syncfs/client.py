@@ -117,10 +117,13 @@ class Client:
         try:
             return self._read_all(self._kept(path, O_RDONLY))
         except FsError as error:
+            self._forget(path, O_RDONLY)
             if error.errno not in (errno.ENOENT, errno.EBADF):
-                raise
-            self._forget(path, O_RDONLY)  # it was removed, and may have been made anew
+                raise _at(path, error) from error
+        try:  # it was removed, and may have been made anew
             return self._read_all(self._kept(path, O_RDONLY))
+        except FsError as error:
+            raise _at(path, error) from error
 
     def _read_all(self, fid: int) -> bytes:
         data: bytes = self._call("Tread", fid, 0, self._piece)[0]
@@ -181,9 +184,9 @@ class Client:
         fid = self._walked(folder or "/")
         try:
             self._call("Tlcreate", fid, name, O_WRONLY, 0o644, 0)
-        except FsError:
+        except FsError as error:
             self._clunk(fid)
-            raise
+            raise _at(path, error) from error
         return fid
 
     def remove(self, path: str) -> None:
@@ -256,9 +259,9 @@ class Client:
             if access >= 0:
                 try:
                     self._call("Tlopen", fid, access)
-                except FsError as error:
+                except FsError:
                     self._clunk(fid)
-                    raise _at(path, error) from error
+                    raise
             self._open[path, access] = fid
         return fid
 

@@ -61,6 +61,14 @@ class FileServer:
     async def _listen(self, address: Address, anywhere: bool) -> Address:
         if not address.is_local and not anywhere:
             raise FsError(1, f"{address} can be reached from other machines; say --anywhere if that is meant")
+        try:
+            return await self._bound(address)
+        except OSError as error:
+            if isinstance(error, FsError):
+                raise
+            raise FsError(error.errno or 5, f"{address}: {error.strerror or error}") from error
+
+    async def _bound(self, address: Address) -> Address:
         if address.path is not None:
             _clear(address)
             before = os.umask(0o177)
