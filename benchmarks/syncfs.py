@@ -1,10 +1,11 @@
 """How quick the file server is, each client a process: small operations, barrier, and edges in real time.
 
-    python benchmarks/syncfs.py [ops] [barrier] [100ms] [10ms] [1ms] [--seconds 30] [--load]
+    python benchmarks/syncfs.py [ops] [barrier] [100ms] [10ms] [1ms] [--seconds 30] [--load] [--python]
 
 ops: reads of 100 bytes, against a bare asyncio server that answers as many bytes. The others: N components, each stats
 its clock, reads the status of four others and writes its own; 100ms and 1ms as any process, 10ms with SCHED_FIFO where
-the system grants it. --load: two busy loops beside it. The issue's 10 minutes: `100ms --seconds 600`.
+the system grants it. Components are syncfs_client.c, so that it is the server that is measured; --python, or without a
+C compiler: `component` below. --load: two busy loops beside it. The issue's 10 minutes: `100ms --seconds 600`.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import asyncio
 import contextlib
 import json
 import os
+import shutil
 import socket
 import statistics
 import subprocess
@@ -32,6 +34,7 @@ from rtdb.syncfs.server import new_loop
 BYTES = 100
 TREAD = LINUX.encode[TYPES["Tread"]]
 OPS_S, ROUNDS = 2.0, 3
+MOST_VALUES = 20_000  # that a component tells
 
 
 # -- processes --------------------------------------------------------------------------------------------------------
@@ -173,58 +176,93 @@ def serve_edges(address: str, clock: str, tick_ns: int, every: int, names: list[
         assert store.name is not None
         files = FileServer(store.name, pace=Pace(every), seats=seats, tokens=tokens)
         store.run_clock(tuple(names) if clock == "barrier" else ())
-        run(files, [Address.parse(address)], ready=lambda _: tell(list(got.refused) if got else []))
+        run(files, [Address.parse(address)], ready=lambda _: tell(list(got.refused) if got is not None else []))
 
 
-def component(address: str, name: str, others: list[str], seconds: float, db: str, fifo: bool) -> None:
-    """Be a component: tells edges, missed ones, and how late it was woken, in us."""
+def compiled(folder: Path) -> Path | None:
+    """Compile syncfs_client.c; None where there is no C compiler."""
+    compiler = (os.environ.get("CC") or "cc").split()
+    if shutil.which(compiler[0]) is None:
+        print(f"no C compiler ({compiler[0]}; $CC names another): the components are Python processes")
+        return None
+    source, program = Path(__file__).with_name("syncfs_client.c"), folder / "syncfs_client"
+    subprocess.run([*compiler, "-std=c11", "-O2", "-Wall", "-Wextra", str(source), "-o", str(program)], check=True)
+    return program
+
+
+def component(address: str, name: str, others: list[str], seconds: float, fifo: bool) -> None:
+    """Be a component: tells edges, missed ones, and how late it was woken: the host's steady time less store time."""
     if fifo:
         realtime(40)
-    with Store.attach(db) as store:
-        offset_ns = store.now_ns - time.monotonic_ns()
     with Client.connect(address, name) as client:
         clock, status = f"/{name}/clock", f"/{name}/status"
         client.rewrite(status, b'{"n": 0}\n')
         tell("ready")
         sys.stdin.readline()
         fid = client._kept(clock, -1)
-        late_us, missed, last, end = [], 0, None, time.monotonic() + seconds
+        late_ns, missed, last, end = [], 0, None, time.monotonic() + seconds
         while time.monotonic() < end:
             values = client._call("Tgetattr", fid, 0x3FFF)
-            woken_ns = time.monotonic_ns() + offset_ns
-            late_us.append((woken_ns - values[12] * 1_000_000_000 - values[13]) / 1000)
+            late_ns.append(time.monotonic_ns() - values[12] * 1_000_000_000 - values[13])
             if last is not None and values[19] > last + 1:
                 missed += values[19] - last - 1
             last = values[19]
             for other in others:
                 client.read(f"/{other}/status")
             client.rewrite(status, b'{"n": %d}\n' % last)
-        report = client.read_json("/server")
-    late_us.sort()
-    tell(
-        {"edges": len(late_us), "missed": missed, "late_us": late_us[:: max(1, len(late_us) // 2000)], "server": report}
-    )
+    late_ns.sort()
+    edges, n = len(late_ns), min(len(late_ns), MOST_VALUES)
+    shown = [late_ns[k * (edges - 1) // max(1, n - 1)] for k in range(n)]  # the least and the greatest among them
+    tell({"edges": edges, "missed": missed, "fifo": os.sched_getscheduler(0) == os.SCHED_FIFO, "late_ns": shown})
 
 
-def edges(folder: Path, what: str, clock: str, tick_ns: int, every: int, n: int, seconds: float, fifo: bool) -> None:
+def client(
+    program: Path | None, address: str, name: str, others: list[str], seconds: float, fifo: bool
+) -> "subprocess.Popen[str]":
+    if program is None:
+        return child("component", address, name, others, seconds, fifo)
+    command = [str(program), address.removeprefix("unix:"), name, str(seconds), str(int(fifo)), *others]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def edges(
+    folder: Path,
+    program: Path | None,
+    what: str,
+    clock: str,
+    tick_ns: int,
+    every: int,
+    n: int,
+    seconds: float,
+    fifo: bool,
+    served: bool = False,
+) -> None:
+    """Run components as clients, and say what they saw. program: the C client, None for Python; served: FIFO server."""
     address, names = f"unix:{folder}/edges", [f"c{k}" for k in range(n)]
-    job = ("serve_edges", address, clock, tick_ns, every, names, fifo)
+    job = ("serve_edges", address, clock, tick_ns, every, names, fifo or served)
     process = child(*job)
     try:
         refused = said(process)
-        db = f"bench-{os.getpid()}"
+        with Store.attach(f"bench-{os.getpid()}") as store:  # whoever is interrupted between the clocks sees too little
+            offset_ns = max(store.now_ns - time.monotonic_ns() for _ in range(100))
         clients = [
-            child("component", address, name, [names[(k + j) % n] for j in range(1, 5)], seconds, db, fifo)
+            client(program, address, name, [names[(k + j) % n] for j in range(1, 5)], seconds, fifo)
             for k, name in enumerate(names)
         ]
         found = together(clients)
+        with Client.connect(address) as watcher:
+            report = watcher.read_json("/server")
     finally:
         process.terminate()
         process.wait()
-    late = sorted(us for one in found for us in one["late_us"])
+    late = sorted((ns + offset_ns) / 1000 for one in found for ns in one["late_ns"])
     seen, missed = sum(one["edges"] for one in found), sum(one["missed"] for one in found)
-    scheduling = "any process" if not fifo else "SCHED_FIFO" + (f" (refused: {'; '.join(refused)})" if refused else "")
-    print(f"{what}: {n} components, {seconds:g} s, {scheduling}")
+    scheduling = "any process" if not fifo else "SCHED_FIFO"
+    scheduling += ", the server SCHED_FIFO" if served else ""
+    scheduling += f" (refused: {'; '.join(refused)})" if refused else ""
+    if fifo and not all(one["fifo"] for one in found):
+        scheduling += ", components without it"
+    print(f"{what}: {n} components in {'C' if program else 'Python'}, {seconds:g} s, {scheduling}")
     if clock == "barrier":
         print(f"  {max(one['edges'] for one in found) / seconds:.0f} edges/s")
         return
@@ -233,7 +271,7 @@ def edges(folder: Path, what: str, clock: str, tick_ns: int, every: int, n: int,
         f"median {late[len(late) // 2]:.0f} us, p99 {late[len(late) * 99 // 100]:.0f} us, max {late[-1]:.0f} us"
     )
     for key, text in (("heard_us", "server heard of the edge"), ("answered_us", "had answered all who waited")):
-        bins = found[0]["server"][key]
+        bins = report[key]
         print(f"  {text}: " + ", ".join(f"<{2 << k} us {count}" for k, count in enumerate(bins) if count))
 
 
@@ -245,6 +283,7 @@ def main() -> None:
     parser.add_argument("what", nargs="*", help="ops, barrier, 100ms, 10ms, 1ms [all]")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--load", action="store_true")
+    parser.add_argument("--python", action="store_true", help="components are Python processes, not syncfs_client.c")
     parser.add_argument("--job", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.job:
@@ -252,19 +291,19 @@ def main() -> None:
         {f.__name__: f for f in (serve_ops, serve_echo, ask, serve_edges, component)}[name](*values)
         return
     wanted = args.what or ["ops", "barrier", "100ms", "10ms", "1ms"]
-    print(
-        f"{os.cpu_count()} CPUs, load {os.getloadavg()[0]:.1f}, {'two busy loops' if args.load else 'nothing'} beside it"
-    )
+    beside = "two busy loops" if args.load else "nothing"
+    print(f"{os.cpu_count()} CPUs, load {os.getloadavg()[0]:.1f}, {beside} beside it")
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 if args.load else 0)]
     try:
         with tempfile.TemporaryDirectory() as place:
             folder, s = Path(place), args.seconds
+            program = compiled(folder) if set(wanted) - {"ops"} and not args.python else None
             rows = {
                 "ops": lambda: ops(folder),
-                "barrier": lambda: edges(folder, "barrier", "barrier", 10_000_000, 1, 32, min(s, 10.0), False),
-                "100ms": lambda: edges(folder, "100 ms", "real", 10_000_000, 10, 32, s, False),
-                "10ms": lambda: edges(folder, "10 ms", "real", 10_000_000, 1, 16, s, True),
-                "1ms": lambda: edges(folder, "1 ms", "real", 1_000_000, 1, 4, min(s, 10.0), False),
+                "barrier": lambda: edges(folder, program, "barrier", "barrier", 10_000_000, 1, 32, min(s, 10.0), False),
+                "100ms": lambda: edges(folder, program, "100 ms", "real", 10_000_000, 10, 32, s, False, True),
+                "10ms": lambda: edges(folder, program, "10 ms", "real", 10_000_000, 1, 16, s, True),
+                "1ms": lambda: edges(folder, program, "1 ms", "real", 1_000_000, 1, 4, min(s, 10.0), False),
             }
             for row in wanted:
                 rows[row]()

@@ -21,7 +21,8 @@ from .pace import Pace
 RING_BYTES = 32 << 10  # of a file's slots, as long as that is enough for a few
 LEAST_SLOTS, MOST_SLOTS = 6, 100
 LEAST_BYTES = 256
-KEPT = 8192  # handles that are not looked through for deleted objects
+SHARE = 0.5  # of the store's memory is for free files, at most: components need the rest
+KEPT = 1000  # so many handles of deleted objects are not looked through
 _COUNT = struct.Struct("<I")
 
 
@@ -150,7 +151,10 @@ class Contents:
         self.store, self._component, self._pace, self._prefix = store, component, pace, f"{component.name}/{prefix}"
         self._changed = changed  # called with the version of the directory before each change
         self.busy: set[Content] = set()  # those for which the next edge has work
-        self._handles = {int(o.name[len(self._prefix) :]): o.handle for o in store.objects(f"{self._prefix}[0-9]*")}
+        self._most = int(store.memory[0] * SHARE)
+        there = {int(o.name[len(self._prefix) :]): o for o in store.objects(f"{self._prefix}[0-9]*")}
+        self._handles = {number: obj.handle for number, obj in there.items()}
+        self._sizes = {number: obj.n_slots * (obj.size + 64) for number, obj in there.items()}  # of those that live
         self.last = max(self._handles, default=0)
 
     def handle(self, number: int) -> int:
@@ -169,30 +173,40 @@ class Contents:
     def insert(self, room: int, slots: int) -> int:
         """Insert an object; returns its number."""
         number, period_s, before = self.last + 1, self._pace.every * self.store.tick_ns * 1e-9, self.store.core.version
+        size = slots * (room + 128)
+        if sum(self._sizes.values()) + size > self._most:
+            raise StoreFull(f"free files take at most {SHARE:.0%} of the store")
         writer: Writer[Record] = self._component.insert(
             f"{self._prefix.partition('/')[2]}{number}",
             schema_for(room),
             every=self._pace.every,
             phase=self._pace.phase,
             history_s=slots * period_s,
-            budget_bytes=slots * (room + 128),
+            budget_bytes=size,
             flags=HOST_DEPENDENT,
         )
         self.last, self._handles[number] = number, writer.handle
+        self._sizes[number] = size
         self._changed(before)
         return number
 
     def delete(self, number: int) -> None:
         """Delete an object; its history stays for a while."""
         before = self.store.core.version
+        self._sizes.pop(number, None)
         with contextlib.suppress(Deleted, ObjectMissing):
             self.store.core.delete(self.handle(number))
             self._changed(before)
-        for old in list(self._handles)[:-KEPT]:  # what is that old is gone from the store, too
-            with contextlib.suppress(Deleted):
-                self.store.core.object(self._handles[old])
-                continue
-            del self._handles[old]
+        if len(self._handles) > 2 * len(self._sizes) + KEPT:
+            self._forget_gone()
+
+    def _forget_gone(self) -> None:
+        """Drop the handles of objects whose history is over, too."""
+        for number, handle in list(self._handles.items()):
+            try:
+                self.store.core.object(handle)
+            except Deleted:
+                del self._handles[number]
 
     def edge(self, cycle: int) -> None:
         """Do what waited for an edge."""

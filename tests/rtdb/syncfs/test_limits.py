@@ -1,6 +1,7 @@
 """Limits, each with its error; very many fids and stats; and clients that are slow, dead or greedy delay nobody."""
 
 import asyncio
+import contextlib
 import errno
 import socket
 import threading
@@ -10,6 +11,7 @@ import tracemalloc
 import pytest
 
 from rtdb import Store
+from rtdb.json_object import json_schema
 from rtdb.syncfs import Address, Client, FileServer, FsError, Limits, SeatSpec, Tokens
 from rtdb.syncfs.codec import LINUX, NOFID, NOTAG, TYPES
 
@@ -544,3 +546,23 @@ def test_the_socket_is_for_its_owner_only_and_goes_with_the_server(serve):
         assert served.address.path.stat().st_mode & 0o777 == 0o600
         path = served.address.path
     assert not path.exists()
+
+
+def test_free_files_leave_half_of_the_store_to_the_components(make_rig):
+    rig = make_rig(size=4 << 20)
+    fs, n = rig.client(), 0
+    with contextlib.suppress(Refused):
+        for n in range(200):
+            fs.write(f"f{n}", bytes(100_000), sync=True)
+    assert 0 < n < 199
+    with pytest.raises(Refused) as caught:
+        fs.write("one more", bytes(100_000))
+    assert caught.value.code == errno.ENOSPC
+    size, unused = rig.store.memory
+    assert unused > 0.4 * size
+    late = rig.store.join("late")
+    late.insert("object", json_schema(4000), history_s=1.0)
+    fs.rm("f0")
+    fs.write("after", b"there is room again", sync=True)
+    rig.edge()
+    assert fs.read("after") == b"there is room again"
