@@ -63,6 +63,11 @@ def changed(stack: Stack, change: Change) -> Stack:
     known = [*(wire.component for wire in stack.wires), ACTUATORS]
     if change.component not in known:
         raise ModuleError(f"no component {change.component!r}; {did_you_mean(change.component, known, 'there are')}")
+    if any(wire.component == change.component and wire.is_files for wire in stack.wires):
+        raise ModuleError(
+            f"{change.component} is a script, and reads its wiring itself: write it into /{change.component}/config, "
+            "through the file server"
+        )
     ports = ["drive"] if change.component == ACTUATORS else list(_module(stack, change.component).inputs)
     if change.name not in ports:
         raise ModuleError(

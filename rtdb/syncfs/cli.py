@@ -141,11 +141,8 @@ def seats_of(components: list[str], given: list[str], every: int, *, operator: b
         due, phase = (ticks + [every, 0][len(ticks) :])[:2]
         if not 0 <= phase < due:
             raise typer.BadParameter(f"{said!r}: 0 <= PHASE < EVERY", param_hint="--component")
-        seats.append(
-            SeatSpec(
-                component=name, every=due, phase=phase, latency_cycles=due - 1, config={"every": due, "phase": phase}
-            )
-        )
+        wiring = {"module": "files", "every": due, "phase": phase, "inputs": {}, "latency_cycles": due - 1}
+        seats.append(SeatSpec(component=name, every=due, phase=phase, latency_cycles=due - 1, config=wiring))
         tokens.give(name, texts.pop(name, None))
     if operator:
         tokens.give(OPERATOR, texts.pop(OPERATOR, None))

@@ -81,7 +81,8 @@ class Service:
         clock = self.store.clock
         slow_s = 2e-9 * self.tree.pace.every * clock.tick_ns if self._real else 0.0
         grace_s = max(self._grace_s, slow_s)
-        if len(self.waiting) and now_s - self._edge_s > grace_s:
+        begun = self.store.cycle > 0 or not self._real  # a run that gathers its parts does not stand
+        if begun and len(self.waiting) and now_s - self._edge_s > grace_s:
             self.waiting.stopped(self.store.cycle, now_s - grace_s, participants=self._real or not clock.alive)
         for seat in self.tree.seats.values():
             seat.idle(now_s)

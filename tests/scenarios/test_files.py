@@ -11,9 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from live_run import LiveRun
+from typer.testing import CliRunner
 
 from autonomy.wiring import load_stack
+from hal.signals import Odometry
 from rtdb.recording import Recording
+from rtdb.syncfs import Client
+from scenarios.cli import app
 from scenarios.judge import judge
 from scenarios.run import Drive, DriveError, Setup, drive
 from scenarios.scenario import Scenario, load_scenario
@@ -207,3 +212,54 @@ def test_what_is_wrong_with_a_server_ends_the_drive_in_one_line(short: Scenario,
     setup = replace(setup_of(short, tmp_path), listen="tcp:192.0.2.1:5640")
     with pytest.raises(DriveError, match="the process of files ended at once"):
         Drive(setup)
+
+
+# -- in real time -----------------------------------------------------------------------------------------------------
+
+SLOWLY = """
+import sys
+from rtdb.syncfs import Client
+with Client.connect(sys.argv[1], sys.argv[2]) as fs:
+    while True:
+        fs.wait("/shell/clock")
+        fs.write_json("/shell/status", {"drive": {"speed_mps": 0.7, "steer_rad": 0.0, "decel_mps2": 1.0}})
+"""
+
+
+@pytest.mark.proof
+def test_a_running_cart_is_wired_to_a_script_and_stands_when_the_script_dies(tmp_path: Path) -> None:
+    live = LiveRun(tmp_path, metres=100)
+    address = f"unix:{tmp_path}/9p"
+    words = ["serve", "--db", live.name, "--listen", address, "--component", "shell:4:2", "--token", f"shell={TOKEN}"]
+    server = subprocess.Popen([sys.executable, "-m", "scenarios", *words], env=ENV, stdout=subprocess.DEVNULL)
+    try:
+        live.until_it_drives()
+        with script(tmp_path, sys.executable, "-c", SLOWLY) as slowly:
+            live.until(lambda: live.value("shell/status") is not None)
+            done = CliRunner().invoke(app, ["wire", live.name, "guard.drive_in=shell/drive", "--yes"])
+            assert done.exit_code == 0, done.output
+            live.until(lambda: live.value("guard/drive")["speed_mps"] == 0.7)
+            with Client.connect(address) as fs:
+                config = fs.read_json("/guard/config")
+                assert config["inputs"]["drive_in"] == "shell/drive"
+            slowly.kill()
+            live.until(lambda: live.value("guard/drive")["speed_mps"] == 0.0)
+        live.until(lambda: live.value("odometry/travel")["speed_mps"] == 0.0)
+        assert live.value("shell/health")["state"] == "FAILURE"
+    finally:
+        server.terminate()
+        server.wait()
+        live.close()
+
+
+@pytest.mark.proof
+def test_a_script_drives_in_real_time(tmp_path: Path) -> None:
+    words = ["run", "parking-lot/square", "--use", "follow=files", "--listen", f"unix:{tmp_path}/9p", "--for", "12"]
+    words += ["--token", f"follow={TOKEN}", "--out", str(tmp_path)]
+    with script(tmp_path, *steer_py()):
+        done = subprocess.run(
+            [sys.executable, "-m", "scenarios", *words], env=ENV, text=True, capture_output=True, check=False
+        )
+    assert "ended: 12 s are over" in done.stdout, done.stderr
+    moved = Recording(tmp_path / "parking-lot" / "square" / "0-real" / "run.mcap").read("odometry/travel", Odometry)
+    assert max(sample.value.speed_mps for sample in moved) > 2.0
