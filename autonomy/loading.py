@@ -27,7 +27,7 @@ def load_module(spec: str) -> type[Module]:
         return load_policy(Path(spec))
     place, _, name = spec.rpartition(":")
     if not place:
-        raise ModuleError(f"{spec!r}: name a module as FILE.py:Class or package.module:Class")
+        raise ModuleError(f"{spec!r}: name a module as FILE.py:Class or package.module:Class; files means a script")
     try:
         loaded = _from_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
     except ModuleError:

@@ -17,6 +17,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from rtdb.syncfs.policy import RESERVED
+
 from .files import FILES
 from .loading import inputs_of, load_module, make_module
 from .module import ModuleError
@@ -122,6 +124,8 @@ def wire_of(where: str, component: str, entry: Any) -> Wire:
     missing = [key for key in KEYS[:4] if key not in entry]
     if missing:
         raise ModuleError(f"{where}: the key {missing[0]!r} is missing")
+    if component in RESERVED:
+        raise ModuleError(f"{where}: no component is called {component}: {', '.join(RESERVED)} mean something else")
     wire = Wire(component, **entry)
     if not isinstance(wire.module, str):
         raise ModuleError(f"{where}: module is package.module:Class or FILE.py:Class, got {wire.module!r:.60}")
@@ -144,7 +148,7 @@ def wire_of(where: str, component: str, entry: Any) -> Wire:
 
 def check_stack(stack: Stack) -> None:
     """Refuse a stack in which modules wait for each other: each needs an output of the next before it can begin."""
-    needs = {wire.component: needed(wire) for wire in stack.wires}
+    needs = {wire.component: [] if wire.is_files else needed(wire) for wire in stack.wires}  # a script just begins
     for start in needs:
         path = _loop(start, needs, [start])
         if path:
@@ -164,7 +168,9 @@ def _loop(start: str, needs: dict[str, list[str]], path: list[str]) -> list[str]
 
 
 def needed(wire: Wire) -> list[str]:
-    """Name the components without whose outputs a module is not called."""
+    """Name the components without whose outputs a module is not called; of a script, all that it is wired to."""
+    if wire.is_files:
+        return [pointer.partition("/")[0] for pointer in wire.inputs.values()]
     ports = load_module(wire.module).inputs
     wired = wire.objects().items()
     return [name.partition("/")[0] for port, name in wired if port in ports and not ports[port].optional]

@@ -109,6 +109,8 @@ def drive(
         raise ModuleError(f"{scenario} is a module; put it into a stack with --use COMPONENT=FILE.py:Class")
     plan = load_scenario(scenario)
     stack = stack_with(plan.stack_path(), use or [])
+    if listen is not None and not any(wire.is_files for wire in stack.wires):
+        raise typer.BadParameter("no component is a script; --use COMPONENT=files makes one", param_hint="--listen")
     folder = out / plan.id / str(seed)
     folder.mkdir(parents=True, exist_ok=True)
     setup = Setup(

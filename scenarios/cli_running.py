@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtdb.db.change import examples
+from rtdb.syncfs.cli import tokens_said
 
 if TYPE_CHECKING:
     from autonomy.wiring import Stack
@@ -70,6 +71,8 @@ def run(
         raise typer.BadParameter(f"{level!r} is not one of direct, wire", param_hint="--level")
     plan = load_scenario(scenario)
     stack = with_whole_paths(stack_with(plan.stack_path(), use or []))
+    if listen is not None and not any(wire.is_files for wire in stack.wires):
+        raise typer.BadParameter("no component is a script; --use COMPONENT=files makes one", param_hint="--listen")
     folder = out / plan.id / f"{seed}-real"
     folder.mkdir(parents=True, exist_ok=True)
     setup = RunSetup(
@@ -93,13 +96,7 @@ def with_whole_paths(stack: "Stack") -> "Stack":
 
 def tokens_of(stack: "Stack", said: list[str]) -> dict[str, str]:
     """Read what --token says; only scripts have one."""
-    scripts = [wire.component for wire in stack.wires if wire.is_files]
-    tokens = dict(text.partition("=")[::2] for text in said)
-    for component, text in tokens.items():
-        if component not in scripts or not text:
-            known = ", ".join(scripts) or "none; --use COMPONENT=files makes one"
-            raise typer.BadParameter(f"{component}: expected COMPONENT=TOKEN of a script; there is {known}")
-    return tokens
+    return tokens_said(said, [wire.component for wire in stack.wires if wire.is_files])
 
 
 def _run(setup: "RunSetup") -> int:

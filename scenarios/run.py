@@ -224,10 +224,11 @@ class Drive:
         """Wait until all modules are done with a cycle; one that hangs is ended. The cart's limits stop the cart."""
         while not self.cart.wait_done(cycle, HANG_S):
             for info in self.cart.components():
-                if info.name in self._children and info.alive and info.done < cycle:
+                process = self._children.get("files" if info.name in self._scripts else info.name)
+                if process is not None and info.participant and info.alive and info.done < cycle:
                     self.lost = self.lost or f"the process of {info.name} hung in cycle {cycle}, and was ended"
-                    self._children[info.name].kill()
-                    self._children[info.name].wait()
+                    process.kill()
+                    process.wait()
         for component, child in self._children.items():
             if not self.lost and child.poll() is not None:
                 self.lost = f"the process of {component} ended in cycle {cycle} ({ending(child.returncode)})"

@@ -32,6 +32,7 @@ from hal.bus import Level
 from hal.errors import HalError
 from hal.signals import FollowState, GuardState, ModuleState, ModuleStatus, Odometry, SafetyState, SystemState
 from rtdb import Record, RtdbError, State, Store, Writer
+from rtdb.syncfs.policy import Tokens
 from rtdb.syncfs.process import spawn as spawn_server
 
 from .cart import TICK_NS, DriveError
@@ -136,6 +137,9 @@ class Supervisor:
     def __init__(self, setup: RunSetup, say: Callable[[str], None], asked: Callable[[], str]) -> None:
         self.setup, self._say, self._asked = setup, say, asked
         self._required = required(setup.stack)
+        self._tokens = Tokens()  # the same for a server that is started anew
+        for wire in setup.scripts:
+            self._tokens.give(wire.component, setup.tokens.get(wire.component))
         self._children: dict[str, Child] = {}
         self._recordings = 0
         scenario = setup.scenario
@@ -206,7 +210,7 @@ class Supervisor:
     def _start_files(self) -> None:
         setup = self.setup
         seats = [seat_of(wire) for wire in setup.scripts]
-        self._adopt(Child("files", "files", spawn_server(setup.db, seats, setup.listen, setup.tokens, group=0)))
+        self._adopt(Child("files", "files", spawn_server(setup.db, seats, setup.listen, self._tokens.of, group=0)))
 
     def _start_recorder(self) -> None:
         setup, self._recordings = self.setup, self._recordings + 1
@@ -360,6 +364,9 @@ class Supervisor:
         """Whether nobody will move the cart again. A module that nobody drives by may fail."""
         safety = self._newest("safety/state", SafetyState)
         if safety is not None and safety.state is SystemState.FAULT:
+            return True
+        scripts = [f"{wire.component}/status" for wire in self.setup.scripts if wire.component in self._required]
+        if any(sample is not None and is_end(sample.value) for sample in (self.cart.find(n).latest() for n in scripts)):
             return True
         ends: dict[str, type[Record]] = {cls.__name__: cls for cls in (FollowState, GuardState, ModuleStatus)}
         return any(

@@ -12,7 +12,7 @@ WAYPOINTS = [(15.0, -15.0), (15.0, 15.0), (-15.0, 15.0), (-15.0, -15.0)]
 
 with Client.connect(sys.argv[1], sys.argv[2]) as fs:
     k = 0
-    while fs.wait("/follow/clock"):  # done with this cycle; now it is the next
+    for _ in fs.edges("/follow/clock"):  # done with this cycle; now it is the next
         pose = fs.read_json("/localise/status")["pose"]
         if pose is None:
             continue

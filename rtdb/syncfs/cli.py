@@ -126,13 +126,15 @@ def _made_if_absent(db: str, clock: str, tick_ms: float, size_mb: int, wait_for:
 
 def seats_of(components: list[str], given: list[str], every: int, *, operator: bool) -> "tuple[list[SeatSpec], Tokens]":
     """Read what --component and --token say."""
-    from .policy import OPERATOR, Tokens
+    from .policy import OPERATOR, RESERVED, Tokens
     from .seats import SeatSpec
 
     seats, tokens = [], Tokens()
-    texts = dict(text.partition("=")[::2] for text in given)
+    texts = tokens_said(given, [said.partition(":")[0] for said in components] + [OPERATOR] * operator)
     for said in components:
         name, *numbers = said.split(":")
+        if "/" in name or name in RESERVED:
+            raise typer.BadParameter(f"{said!r}: no component is called that", param_hint="--component")
         if not name or len(numbers) > 2 or not all(number.isdecimal() for number in numbers):
             raise typer.BadParameter(
                 f"{said!r}: expected NAME, NAME:EVERY or NAME:EVERY:PHASE", param_hint="--component"
@@ -140,15 +142,27 @@ def seats_of(components: list[str], given: list[str], every: int, *, operator: b
         ticks = [int(number) for number in numbers]
         due, phase = (ticks + [every, 0][len(ticks) :])[:2]
         if not 0 <= phase < due:
-            raise typer.BadParameter(f"{said!r}: 0 <= PHASE < EVERY", param_hint="--component")
+            raise typer.BadParameter(f"{said!r}: EVERY is at least 1, and PHASE below it", param_hint="--component")
         wiring = {"module": "files", "every": due, "phase": phase, "inputs": {}, "latency_cycles": due - 1}
         seats.append(SeatSpec(component=name, every=due, phase=phase, latency_cycles=due - 1, config=wiring))
         tokens.give(name, texts.pop(name, None))
     if operator:
         tokens.give(OPERATOR, texts.pop(OPERATOR, None))
-    if texts or "" in texts.values():
-        raise typer.BadParameter(f"{', '.join(texts)}: no such --component", param_hint="--token")
     return seats, tokens
+
+
+def tokens_said(given: list[str], known: list[str]) -> dict[str, str]:
+    """Read NAME=TOKEN of components that are known."""
+    texts: dict[str, str] = {}
+    for said in given:
+        name, _, text = said.partition("=")
+        if name not in known:
+            there = ", ".join(known) or "none"
+            raise typer.BadParameter(f"{said}: {name!r} is no script here; there is {there}", param_hint="--token")
+        if not text or "," in text or text in texts.values():
+            raise typer.BadParameter(f"{said}: NAME=TOKEN, each another, without a comma", param_hint="--token")
+        texts[name] = text
+    return texts
 
 
 def invitation(addresses: "list[Address]", tokens: "Tokens") -> list[str]:
@@ -185,8 +199,13 @@ def _client(db: str, at: str | None, token: str, wait_s: float) -> "Client":
         try:
             return Client.connect(at if at is not None else default_address(db), token)
         except FsError as error:
-            if error.errno not in (errno.ENOENT, errno.ECONNREFUSED) or time.monotonic() > deadline_s:
+            if error.errno not in (errno.ENOENT, errno.ECONNREFUSED):
                 raise
+            if time.monotonic() > deadline_s:
+                if at is not None:
+                    raise
+                why = f"store {db!r} is not served here: `fairway serve --db {db}` does, or --at says where ({error})"
+                raise FsError(error.errno, why) from error
             time.sleep(0.05)  # there is nothing to wait on yet
 
 
@@ -275,7 +294,7 @@ def lines(db: Db = "cart", at: At = None, token: TokenOption = "", wait: Wait = 
     with _client(db, at, token, wait) as client:
         for line in sys.stdin:
             verb, _, rest = line.strip().partition(" ")
-            if verb in ("", "bye"):
+            if verb == "bye":
                 break
             try:
                 print(answer(client, verb, rest), flush=True)
@@ -290,6 +309,10 @@ def answer(client: "Client", verb: str, rest: str) -> str:
     from .errors import FsError
 
     path, _, text = rest.partition(" ")
+    if verb == "wait" and path.rpartition("/")[2] != "clock":
+        return f"error: {path or 'nothing'} is no clock; wait /clock, or /COMPONENT/clock"
+    if verb in ("cat", "write") and not path:
+        return f"error: {verb} PATH"
     if verb == "wait":
         return str(client.wait(path))
     if verb == "cat":

@@ -1,7 +1,7 @@
 """A client: what a mount does, without one.
 
     with Client.connect(address, token=token) as fs:
-        while fs.stat("/clock"):
+        for _ in fs.edges("/follow/clock"):  # done with the last cycle; now it is the next
             pose = fs.read_json("/localise/status")["pose"]
             fs.write_json("/follow/status", {"drive": {"speed_mps": 1.5, "steer_rad": 0.0}})
 
@@ -9,10 +9,12 @@ Calls block; one client belongs to one thread. What goes wrong is an FsError wit
 written again and again stays open.
 """
 
+import contextlib
 import errno
 import json
 import os
 import socket
+from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
@@ -51,7 +53,12 @@ class Client:
         if version != LINUX.name:
             raise FsError(errno.EPROTO, f"the server speaks {version}, not {LINUX.name}")
         self._piece = msize - IO_HEADER
-        self._call("Tattach", ROOT, NOFID, "", token, NO_UID)
+        try:
+            self._call("Tattach", ROOT, NOFID, "", token, NO_UID)
+        except FsError as error:
+            if error.errno == errno.EACCES:
+                raise FsError(errno.EACCES, "this server knows no such token") from error
+            raise
 
     @classmethod
     def connect(
@@ -62,15 +69,19 @@ class Client:
         timeout_s: for each call [a stat of a clock may take long]; msize: largest message, bytes.
         """
         where = Address.parse(address) if isinstance(address, str) else address
-        sock = socket.socket(socket.AF_UNIX if where.path is not None else socket.AF_INET)
+        sock: socket.socket | None = None
         try:
-            sock.settimeout(timeout_s)
-            sock.connect(str(where.path) if where.path is not None else (where.host, where.port))
-            if where.path is None:
+            if where.path is not None:
+                sock = socket.socket(socket.AF_UNIX)
+                sock.connect(str(where.path))
+            else:
+                sock = socket.create_connection((where.host, where.port))
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.settimeout(timeout_s)
             return cls(sock, token, msize)
         except OSError as error:
-            sock.close()
+            if sock is not None:
+                sock.close()
             if isinstance(error, FsError):
                 raise
             raise FsError(
@@ -92,6 +103,17 @@ class Client:
         """Wait for the next edge of a clock, by a fid that stays open; returns how many there were."""
         fid = self._kept(clock, -1)
         return int(self._call("Tgetattr", fid, ALL)[19])
+
+    def edges(self, clock: str = "/clock") -> Iterator[int]:
+        """Yield the number of each edge of a clock as it comes; ends when the server does, as at the end of a drive."""
+        while True:
+            try:
+                n = self.wait(clock)
+            except FsError as error:
+                if error.errno in (errno.ECONNRESET, errno.EPIPE):
+                    return
+                raise
+            yield n
 
     def ls(self, path: str = "/") -> list[str]:
         """List the names in a directory."""
@@ -161,7 +183,18 @@ class Client:
 
     def rewrite(self, path: str, data: bytes) -> None:
         """Write a file that stays open, a revision each time."""
-        new = (path, O_WRONLY) not in self._open
+        if (path, O_WRONLY) not in self._open:
+            self._rewrite(path, data, new=True)
+            return
+        try:
+            self._rewrite(path, data, new=False)
+        except FsError as error:
+            if error.errno not in (errno.ENOENT, errno.EBADF):
+                raise
+            self._forget(path, O_WRONLY)  # it was removed, and may have been made anew
+            self._rewrite(path, data, new=True)
+
+    def _rewrite(self, path: str, data: bytes, *, new: bool) -> None:
         fid = self._kept(path, O_WRONLY)
         if not data:
             self._call("Tsetattr", fid, 8, 0, 0, 0, 0, 0, 0, 0, 0)
@@ -268,7 +301,8 @@ class Client:
     def _forget(self, path: str, access: int) -> None:
         fid = self._open.pop((path, access), None)
         if fid is not None:
-            self._clunk(fid)
+            with contextlib.suppress(FsError):  # what was begun is lost with the file
+                self._clunk(fid)
 
     def _clunk(self, fid: int) -> None:
         self._free.append(fid)
@@ -276,13 +310,20 @@ class Client:
 
     def _call(self, name: str, *values: Any, tag: int = 1) -> tuple[Any, ...]:
         number = TYPES[name]
-        self._sock.sendall(LINUX.encode[number](tag, *values))
-        reply = self._receive()
-        got, _, answer = LINUX.decoded(reply)
+        try:
+            self._sock.sendall(LINUX.encode[number](tag, *values))
+            reply = self._receive()
+        except OSError as error:  # what is under way would answer the next call
+            self._sock.close()
+            if isinstance(error, FsError):
+                raise
+            code = errno.ETIMEDOUT if isinstance(error, TimeoutError) else error.errno or errno.EIO
+            raise FsError(code, f"{name}: {os.strerror(code)}; the connection is closed") from error
+        got, answered, answer = LINUX.decoded(reply)
         if got == _ERROR:
             raise FsError(answer[0])
-        if got != number + 1:
-            raise FsError(errno.EPROTO, f"message {got} is no answer to {name}")
+        if (got, answered) != (number + 1, tag):
+            raise FsError(errno.EPROTO, f"message {got} {answered} is no answer to {name} {tag}")
         return answer
 
     def _receive(self) -> bytes:

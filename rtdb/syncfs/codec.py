@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 HEADER = struct.Struct("<IBH")
 NOTAG, NOFID, NO_UID = 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF
 MAX_WALK = 16
-READ_HEADER, WRITE_HEADER = 11, 23  # bytes of a message in front of its data
+READ_HEADER = 11  # bytes of a reply in front of its data
 IO_HEADER = 24  # what a client leaves room for, whichever it is
 
 DIR, FILE = 0x80, 0x00  # of a qid
 
 
 class Malformed(ValueError):
-    """Bytes that are no message: the connection has lost its place, and ends."""
+    """Bytes that are no message of the dialect."""
 
 
 class Qid(NamedTuple):

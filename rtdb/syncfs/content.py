@@ -45,10 +45,10 @@ def slots_for(room: int) -> int:
 class Content:
     """What one file holds. Revisions are written to the store at once; each shows from the next edge on."""
 
-    __slots__ = ("_files", "_seen", "_slots", "held", "newest", "numbers", "rooms")
+    __slots__ = ("_files", "_overflows", "_seen", "_slots", "held", "newest", "numbers", "rooms")
 
-    def __init__(self, files: "Contents", numbers: list[int] | None = None) -> None:
-        self._files = files
+    def __init__(self, files: "Contents", numbers: list[int] | None = None, *, overflows: bool = True) -> None:
+        self._files, self._overflows = files, overflows  # into another object, when the ring is full for a cycle
         self.numbers: list[int] = numbers or []  # of its objects, oldest first
         self.rooms = [files.room(k) for k in self.numbers]
         self._slots = 0  # of the youngest
@@ -70,12 +70,14 @@ class Content:
         room = room_for(n_bytes)
         slots = max(slots, slots_for(room))
         self.numbers.append(self._files.insert(room, slots))
-        self.rooms.append(room)
+        self.rooms.append(schema_for(room).size - _COUNT.size)  # a record ends at a multiple of 8
         self._slots = slots
         self._files.busy.add(self)
 
     def _written_anew(self, data: bytes) -> bool:
         """Write into a new object, with more slots: the ring is full for this cycle."""
+        if not self._overflows:
+            return False
         try:
             self.grow(len(data), 2 * self._slots)
         except StoreFull:
@@ -111,6 +113,15 @@ class Content:
             raise AgedOut("the history of this file does not reach back so far")
         return b"", 0
 
+    def follow(self, before: "Content") -> None:
+        """Take another file's place: what that one held shows until an edge shows what is here."""
+        if not self.numbers:
+            self.write(b"")
+        self.numbers[:0], self.rooms[:0] = before.numbers, before.rooms
+        before.numbers, before.rooms, before.held = [], [], False
+        self._files.busy.discard(before)
+        self._files.busy.add(self)
+
     def take_newest(self) -> None:
         """Take up the newest revision that a server before us wrote, seen or not."""
         core = self._files.store.core
@@ -142,19 +153,38 @@ class Content:
         self.held = False
 
 
+class Budget:
+    """How much of a store's memory free files take, and may."""
+
+    def __init__(self, store: Store) -> None:
+        self.used, self.most = 0, int(store.memory[0] * SHARE)
+
+
+def ring_bytes(room: int, slots: int) -> int:
+    """Give the bytes that an object takes, about."""
+    return slots * (room + 128)
+
+
 class Contents:
     """The objects that hold contents, all of one component; numbered, and never again under the same number."""
 
     def __init__(
-        self, store: Store, component: Component, pace: Pace, prefix: str, changed: Callable[[int], None]
+        self,
+        store: Store,
+        component: Component,
+        pace: Pace,
+        prefix: str,
+        budget: Budget,
+        changed: Callable[[int], None],
     ) -> None:
+        self._budget = budget
         self.store, self._component, self._pace, self._prefix = store, component, pace, f"{component.name}/{prefix}"
         self._changed = changed  # called with the version of the directory before each change
         self.busy: set[Content] = set()  # those for which the next edge has work
-        self._most = int(store.memory[0] * SHARE)
         there = {int(o.name[len(self._prefix) :]): o for o in store.objects(f"{self._prefix}[0-9]*")}
         self._handles = {number: obj.handle for number, obj in there.items()}
-        self._sizes = {number: obj.n_slots * (obj.size + 64) for number, obj in there.items()}  # of those that live
+        self._sizes = {number: ring_bytes(obj.size, obj.n_slots) for number, obj in there.items()}  # of those that live
+        budget.used += sum(self._sizes.values())
         self.last = max(self._handles, default=0)
 
     def handle(self, number: int) -> int:
@@ -173,8 +203,8 @@ class Contents:
     def insert(self, room: int, slots: int) -> int:
         """Insert an object; returns its number."""
         number, period_s, before = self.last + 1, self._pace.every * self.store.tick_ns * 1e-9, self.store.core.version
-        size = slots * (room + 128)
-        if sum(self._sizes.values()) + size > self._most:
+        size = ring_bytes(room, slots)
+        if self._budget.used + size > self._budget.most:
             raise StoreFull(f"free files take at most {SHARE:.0%} of the store")
         writer: Writer[Record] = self._component.insert(
             f"{self._prefix.partition('/')[2]}{number}",
@@ -187,13 +217,14 @@ class Contents:
         )
         self.last, self._handles[number] = number, writer.handle
         self._sizes[number] = size
+        self._budget.used += size
         self._changed(before)
         return number
 
     def delete(self, number: int) -> None:
         """Delete an object; its history stays for a while."""
         before = self.store.core.version
-        self._sizes.pop(number, None)
+        self._budget.used -= self._sizes.pop(number, 0)
         with contextlib.suppress(Deleted, ObjectMissing):
             self.store.core.delete(self.handle(number))
             self._changed(before)
@@ -217,8 +248,9 @@ class Contents:
     def fits(self, n_bytes: int) -> bool:
         """Say whether a first revision of that size finds room for sure."""
         room = room_for(n_bytes)
-        return slots_for(room) * (room + 128) < self.store.memory[1]
+        size = ring_bytes(room, slots_for(room))
+        return self._budget.used + size <= self._budget.most and size < self.store.memory[1]
 
-    def numbers(self) -> list[int]:
+    def known(self) -> list[int]:
         """Give the numbers of the objects that are there."""
         return list(self._handles)

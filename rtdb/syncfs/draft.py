@@ -37,7 +37,7 @@ class Draft:
         append: bool,
         most_bytes: int,
         piece_bytes: int,
-        is_whole: Callable[[bytes], bool | None] = lambda _: None,
+        is_whole: Callable[[bytes | bytearray], bool | None] = lambda _: None,
         created: bool = False,
     ) -> None:
         self._base, self._commit, self._is_whole, self.append = base, commit, is_whole, append
@@ -85,7 +85,7 @@ class Draft:
         self._data, self.dirty, self.idle = data, True, False
         if len(piece) < self._piece:
             self._ended += 1
-            self._show(bytes(data))
+            self._show(data)
 
     def _append(self, piece: bytes) -> None:
         size = len(self._base()) + len(self._tail) + len(piece)
@@ -99,7 +99,7 @@ class Draft:
         if n_bytes > self._most:
             raise FsError(errno.EFBIG, f"{n_bytes} bytes, at most {self._most}")
 
-    def _show(self, data: bytes) -> None:
+    def _show(self, data: bytearray) -> None:
         """Make a write that has ended a revision, if it is one."""
         if self.truncated and not self._kept:
             return
@@ -139,6 +139,11 @@ class Draft:
             if self.idle or self._tail:
                 self.finish()
             self.idle = True
+
+    @property
+    def n_bytes(self) -> int:
+        """How large it is."""
+        return len(self._tail) + (len(self._data) if self._data is not None else 0)
 
     @property
     def pristine(self) -> bool:

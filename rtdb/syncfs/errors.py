@@ -52,8 +52,3 @@ def errno_of(error: RtdbError) -> int:
     if isinstance(error, FsError):
         return error.errno or errno.EIO
     return next((OF_STORE[cls] for cls in type(error).__mro__ if cls in OF_STORE), errno.EIO)
-
-
-def text_of(code: int) -> str:
-    """Give the text that clients of the older dialects know."""
-    return os.strerror(code)

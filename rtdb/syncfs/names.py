@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ..errors import AgedOut, RtdbError, StoreFull
-from .content import Content, Contents
+from .content import Budget, Content, Contents
 from .nodes import FREE, ROOT, FreeDir, FreeFile, Root
 
 if TYPE_CHECKING:
     from .tree import Tree
 
+KEPT = 16  # cycles whose names are kept at hand
 FILES = "files"  # component that owns the free files; it has no folder of its own
 
 
@@ -25,9 +26,10 @@ class Names:
     def __init__(self, tree: "Tree") -> None:
         store, component = tree.store, tree.component
         self._tree = tree
-        self.contents = Contents(store, component, tree.pace, "", tree.own_change)
-        self._spelled = Contents(store, component, tree.pace, "names-", tree.own_change)
-        self._text = Content(self._spelled, sorted(self._spelled.numbers()))
+        budget = Budget(store)
+        self.contents = Contents(store, component, tree.pace, "", budget, tree.own_change)
+        self._spelled = Contents(store, component, tree.pace, "names-", budget, tree.own_change)
+        self._text = Content(self._spelled, sorted(self._spelled.known()), overflows=False)
         self.root = Root(tree, ROOT, None, "")
         self._last, self.count = FREE, 0
         self._rows: dict[int, bytes] = {}
@@ -79,9 +81,12 @@ class Names:
             for node in nodes:
                 if isinstance(node, FreeFile):
                     node.data.take_newest()
-        except (RtdbError, msgspec.DecodeError):  # damaged, or too old to be there: begin anew
+        except (RtdbError, msgspec.DecodeError, LookupError, TypeError, ValueError):  # damaged: begin anew
             self.root.children.clear()
             nodes = []
+        named = {number for node in nodes if isinstance(node, FreeFile) for number in node.data.numbers}
+        for number in set(self.contents.known()) - named:
+            self.contents.delete(number)
         self.count = len(nodes)
         self._last = max([self._last, *(node.path for node in nodes)])
         if nodes:
@@ -108,6 +113,8 @@ class Names:
         """Give the free files by the names that a cut shows."""
         known = self._past.get(cycle)
         if known is None:
+            if len(self._past) > KEPT:
+                self._past.clear()
             known = self._past[cycle] = FreeDir(self._tree, ROOT, None, "")
             try:
                 self._fill(known, self._text.read(cycle)[0])

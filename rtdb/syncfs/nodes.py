@@ -24,7 +24,7 @@ RW, R, X = 0o666, 0o444, 0o755
 ROOT, CLOCK, SERVER, AT = 1, 2, 3, 4  # numbers of nodes that are always there
 FREE = 16  # free files count from here
 COMPONENTS = 1 << 32  # those of components
-CLOCK_BYTES, SERVER_BYTES, HEALTH_BYTES = 320, 2000, 2400
+CLOCK_BYTES, SERVER_BYTES, HEALTH_BYTES = 320, 8000, 2400
 
 
 class Attr(NamedTuple):
@@ -73,7 +73,7 @@ class File(Node):
         """Make this the next revision: it shows from the next edge on."""
         raise FsError(errno.EACCES, "it is read-only")
 
-    def is_whole(self, data: bytes) -> bool | None:
+    def is_whole(self, data: bytes | bytearray) -> bool | None:
         """Whether a content can be told to be complete; None where nothing tells."""
         return None
 
@@ -103,8 +103,8 @@ class Directory(Node):
         raise NotImplementedError
 
     def attr(self, cycle: int, who: Who) -> Attr:
-        tick = self.tree.store
-        return Attr(stat.S_IFDIR | X, 0, tick.t0_ns + cycle * tick.tick_ns, cycle)
+        store = self.tree.store
+        return Attr(stat.S_IFDIR | X, 0, store.t0_ns + cycle * store.tick_ns, cycle)
 
 
 # -- clocks -----------------------------------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ class StatusFile(File):
         self.check_write(who)
         self.tree.seat_of(self.component).commit(data)
 
-    def is_whole(self, data: bytes) -> bool | None:
+    def is_whole(self, data: bytes | bytearray) -> bool | None:
         return is_json_object(data)
 
     @property
@@ -200,7 +200,7 @@ class ConfigFile(File):
             raise FsError(errno.EINVAL, str(error)) from error
         core.write(self.obj.handle, payload, core.not_before(self.obj.handle, core.now_ns), ())
 
-    def is_whole(self, data: bytes) -> bool | None:
+    def is_whole(self, data: bytes | bytearray) -> bool | None:
         return is_json_object(data)
 
     @property
@@ -208,10 +208,10 @@ class ConfigFile(File):
         return self.obj.size
 
 
-def is_json_object(data: bytes) -> bool:
+def is_json_object(data: bytes | bytearray) -> bool:
     """Whether a text is a JSON object."""
     try:
-        json_payload(data, len(data))
+        json_payload(bytes(data), len(data))
     except RecordError:
         return False
     return True
@@ -307,6 +307,8 @@ class FreeFile(File, Free):
         return Attr(stat.S_IFREG | self.mode, len(data), max(self.mtime_ns, written_ns), cycle, self.uid, self.gid)
 
     def content(self, cycle: int, who: Who) -> bytes:
+        if self.gone:
+            raise FsError(errno.ENOENT, "it was removed")
         return self.data.read(cycle)[0]
 
     def check_write(self, who: Who) -> None:
@@ -316,11 +318,12 @@ class FreeFile(File, Free):
         return self.data.newest
 
     def commit(self, data: bytes, who: Who) -> None:
-        if not self.gone:  # removed while it was open: what is written goes with it
-            before = len(self.data.numbers)
-            self.data.write(data)
-            if len(self.data.numbers) != before:
-                self.tree.names.changed(self)
+        if self.gone:
+            raise FsError(errno.ENOENT, "it was removed")
+        before = len(self.data.numbers)
+        self.data.write(data)
+        if len(self.data.numbers) != before:
+            self.tree.names.changed(self)
 
 
 class FreeDir(Directory, Free):

@@ -78,11 +78,16 @@ def past_of(node: Node, at: int, parent: Directory) -> Node:
 class PastRoot(Directory):
     """The root as it was: components with what they showed, free files by the names that they had."""
 
-    __slots__ = ("at", "free_root")
+    __slots__ = ("at",)
 
     def __init__(self, tree: "Tree", path: int, parent: Directory, at: int) -> None:
         super().__init__(tree, path, parent)
-        self.at, self.free_root = at, tree.names.root_at(at)
+        self.at = at
+
+    @property
+    def free_root(self) -> Directory:
+        """The free files of that time."""
+        return self.tree.names.root_at(self.at)
 
     def child(self, name: str, cycle: int) -> Node | None:
         found: Node | None = self.tree.clock if name == "clock" else self.tree.component_dir(name)

@@ -10,6 +10,7 @@ import secrets
 from dataclasses import dataclass, field
 
 OPERATOR = "operator"
+RESERVED = ("files", "clock", "server", "at", OPERATOR)  # names that no component has
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,6 +19,8 @@ class Limits:
 
     connections: int = 1024  # then the connection is closed at once
     fids: int = 16_384  # of a connection: EMFILE
+    writing: int = 1024  # of these open for writing: EMFILE
+    draft_bytes: int = 32 << 20  # of a connection's unfinished revisions, the small ones apart: ENOSPC
     waiting: int = 16_384  # blocked stats of a connection: EAGAIN
     file_bytes: int = 4 << 20  # EFBIG
     files: int = 4096  # files and directories that clients made: ENOSPC

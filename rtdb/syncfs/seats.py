@@ -21,7 +21,8 @@ from .pace import Pace
 log = logging.getLogger(__name__)
 HISTORY_S = 2.0
 CONFIG_BYTES = 2000
-SILENT_EDGES = 3  # as old may what a script wrote become before its readers take it for absent
+SILENT_EDGES = 3  # without a status, before its health says so
+OWN = ("config", "status", "health")  # its objects
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +52,8 @@ class Seat:
         self._users: set[object] = set()
         self._said = (State.UNKNOWN, "")
         self._begun: int | None = None  # the cycle for which it was woken
-        self._waiting = False  # in a stat of its clock
+        self._came = False  # it has waited for its clock, so it knows how
+        self._waiting = 0  # stats of its clock that are held
         self._since_s = 0.0  # when it was woken, by the host's clock
         self._wrote, self.refused, self.missed = 0, 0, 0
         self._held: bytes | None = None
@@ -91,7 +93,10 @@ class Seat:
         except BaseException:
             component.leave()
             raise
-        self._component, self._begun, self._waiting = component, None, False
+        for obj in store.objects(f"{spec.component}/*"):  # what a module left that was it before
+            if obj.name.partition("/")[2] not in OWN:
+                store.delete(obj)
+        self._component, self._begun, self._came, self._waiting = component, None, False, 0
         self._since_s, self._wrote = time.monotonic(), store.cycle
         self._said = (State.UNKNOWN, "")
         self._say(State.RUNNING, "attached")
@@ -101,13 +106,17 @@ class Seat:
         if user in self._users:
             self._users.discard(user)
             if not self._users:
+                log.warning("%s left: its connection ended in cycle %d", self.spec.component, self._store.cycle)
                 self._leave(f"its connection ended in cycle {self._store.cycle}")
 
     def _leave(self, why: str) -> None:
         if self._component is not None:
-            self._say(State.FAILURE, why)
+            if self._held is not None:
+                self._write(self._held)
+            was, text = self._said
+            self._say(State.FAILURE, f"{why}; {text}" if was is State.WARNING else why)
             self._component.leave()
-            self._component = self._status = None
+            self._component = self._status = self._held = None
 
     # -- what it does ---------------------------------------------------------------------------------------------
 
@@ -142,11 +151,16 @@ class Seat:
         if self._begun is not None and due > self._begun:
             self.missed += (due - self._begun) // self.spec.every
         self._component.done(due if self._begun is None else self._begun)
-        self._waiting = True
+        self._came, self._waiting = True, self._waiting + 1
 
     def wake(self, cycle: int) -> None:
         """Its stat is answered."""
-        self._begun, self._waiting, self._since_s = self.pace.last(cycle), False, time.monotonic()
+        self._begun = self.pace.last(cycle)
+        self.give_up()
+
+    def give_up(self) -> None:
+        """A stat of it is held no longer: whatever it is doing now, it does not wait."""
+        self._waiting, self._since_s = max(0, self._waiting - 1), time.monotonic()
 
     # -- what is seen of it ---------------------------------------------------------------------------------------
 
@@ -161,7 +175,7 @@ class Seat:
 
     def idle(self, now_s: float) -> None:
         """Look at it by the host's clock: a barrier does not wait for ever."""
-        if self._component is None or self._begun is None or self._waiting or self._store.clock.kind is Kind.REAL:
+        if self._component is None or not self._came or self._waiting or self._store.clock.kind is Kind.REAL:
             return  # who has not begun is waited for: people type slowly
         if now_s - self._since_s > self._patience_s:
             cycle = self._store.cycle

@@ -6,9 +6,11 @@ Neither delays an edge: replies go into the sockets' buffers, and the store's cl
 
 import asyncio
 import contextlib
+import errno
 import logging
 import os
 import socket
+import stat
 import struct
 import sys
 import threading
@@ -17,6 +19,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, cast
 
+from ..errors import RtdbError
 from ..store import Store
 from .addresses import Address
 from .errors import FsError
@@ -26,6 +29,8 @@ from .session import Session
 log = logging.getLogger(__name__)
 LOOK_S = 0.25  # between looks at what stands still
 BATCH = 64  # messages of one client that are answered in a row
+STORE_S = 2.0  # between looks whether the store is still there
+ATTACH_S = 10.0  # for a connection to say who it is
 _CREDENTIALS = struct.Struct("3i")
 
 
@@ -46,6 +51,8 @@ class FileServer:
         self._watch: threading.Thread | None = None
         self._told = False  # an edge is on its way to the loop
         self._look: asyncio.TimerHandle | None = None
+        self._looked_s = time.monotonic()
+        self.over = asyncio.Event()  # the store has ended
 
     # -- beginning and end ----------------------------------------------------------------------------------------
 
@@ -60,13 +67,13 @@ class FileServer:
 
     async def _listen(self, address: Address, anywhere: bool) -> Address:
         if not address.is_local and not anywhere:
-            raise FsError(1, f"{address} can be reached from other machines; say --anywhere if that is meant")
+            raise FsError(errno.EPERM, f"{address} can be reached from other machines; say --anywhere if that is meant")
         try:
             return await self._bound(address)
         except OSError as error:
             if isinstance(error, FsError):
                 raise
-            raise FsError(error.errno or 5, f"{address}: {error.strerror or error}") from error
+            raise FsError(error.errno or errno.EIO, f"{address}: {error.strerror or error}") from error
 
     async def _bound(self, address: Address) -> Address:
         if address.path is not None:
@@ -119,6 +126,18 @@ class FileServer:
                     with contextlib.suppress(RuntimeError):  # the loop has ended
                         self._loop.call_soon_threadsafe(self._edge)
 
+    def _look_for_store(self) -> None:
+        """End when the store has: its maker closed it, and another may have its name."""
+        assert self.store.name is not None
+        try:
+            with Store.attach(self.store.name) as found:
+                is_there = found.core.id == self.store.core.id
+        except RtdbError:
+            is_there = False
+        if not is_there and not self.over.is_set():
+            log.warning("store %r has ended, and so does its file server", self.store.name)
+            self.over.set()
+
     def soon(self, call: Callable[[], None]) -> None:
         """Have something done in the loop's next round."""
         self._loop.call_soon(call)
@@ -129,7 +148,16 @@ class FileServer:
             self.service.edge(time.monotonic())
 
     def _look_around(self) -> None:
-        self.service.look(time.monotonic())
+        now_s = time.monotonic()
+        self.service.look(now_s)
+        if now_s - self._looked_s > STORE_S:
+            self._looked_s = now_s
+            self._look_for_store()
+        for connection in list(self.connections):
+            session = connection.session
+            if session is not None and not session.attached and now_s - connection.made_s > ATTACH_S:
+                log.warning("a connection is closed: it did not attach for %g s", ATTACH_S)
+                connection.close()
         self._look = self._loop.call_later(LOOK_S, self._look_around)
 
 
@@ -140,6 +168,8 @@ class Connection(asyncio.Protocol):
         self._server, self._unix = server, unix
         self._transport: asyncio.Transport | None = None
         self.session: Session | None = None  # of a connection that is let in
+        self._turn = False  # it goes on in the loop's next round
+        self.made_s = time.monotonic()
         self._quick: Callable[[int, int, int], None] | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -174,15 +204,26 @@ class Connection(asyncio.Protocol):
             self._after(self.session.feed(data, BATCH))
 
     def _go_on(self) -> None:
+        self._turn = False
         if self.session is not None and not self.session.over:
             self._after(self.session.go_on(BATCH))
 
     def _after(self, more: bool) -> None:
-        """Let others have their turn before this client's next batch."""
-        assert self.session is not None
-        if self.session.over:
+        """Let others have their turn before this client's next batch; it is not listened to meanwhile."""
+        session, transport = self.session, self._transport
+        assert session is not None
+        assert transport is not None
+        if session.over or transport.is_closing():
             self.close()
         elif more:
+            transport.pause_reading()
+            self._take_turn()
+        elif not session.paused:
+            transport.resume_reading()
+
+    def _take_turn(self) -> None:
+        if not self._turn:
+            self._turn = True
             self._server.soon(self._go_on)
 
     def pause_writing(self) -> None:
@@ -195,8 +236,7 @@ class Connection(asyncio.Protocol):
         """It takes them again."""
         if self.session is not None and self._transport is not None:
             self.session.paused = False
-            self._transport.resume_reading()
-            self._server.soon(self._go_on)
+            self._take_turn()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Everything that the connection held goes."""
@@ -220,18 +260,20 @@ def _clear(address: Address) -> None:
     """Remove a socket that a dead server left; FsError where a living one listens."""
     path = str(address.path)
     if len(path.encode()) > 107:
-        raise FsError(36, f"{path}: a socket's path has at most 107 bytes")
+        raise FsError(errno.ENAMETOOLONG, f"{path}: a socket's path has at most 107 bytes")
     if not os.path.lexists(path):
         return
+    if not stat.S_ISSOCK(os.lstat(path).st_mode):
+        raise FsError(errno.EEXIST, f"{path}: there is a file, and it is no socket")
     with socket.socket(socket.AF_UNIX) as probe:
         try:
             probe.connect(path)
         except ConnectionRefusedError:
             os.unlink(path)
         except OSError as error:
-            raise FsError(error.errno or 5, f"{path}: {error.strerror}") from error
+            raise FsError(error.errno or errno.EIO, f"{path}: {error.strerror}") from error
         else:
-            raise FsError(98, f"{path}: a server listens there already")
+            raise FsError(errno.EADDRINUSE, f"{path}: a server listens there already")
 
 
 def new_loop() -> asyncio.AbstractEventLoop:
@@ -260,7 +302,7 @@ def run(
 
     async def serve() -> None:
         loop = asyncio.get_running_loop()
-        over = asyncio.Event()
+        over = server.over
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, over.set)
         try:

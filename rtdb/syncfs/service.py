@@ -79,7 +79,7 @@ class Service:
     def look(self, now_s: float) -> None:
         """Look at what stands still, by the host's clock."""
         clock = self.store.clock
-        slow_s = 2e-9 * self.tree.pace.every * clock.tick_ns if self._real else 0.0
+        slow_s = 2e-9 * clock.tick_ns if self._real else 0.0
         grace_s = max(self._grace_s, slow_s)
         begun = self.store.cycle > 0 or not self._real  # a run that gathers its parts does not stand
         if begun and len(self.waiting) and now_s - self._edge_s > grace_s:
@@ -98,7 +98,7 @@ class Service:
             "edges_skipped": self._skipped,
             "heard_us": self._heard_us,
             "answered_us": self._answered_us,
-            "missed_by_connection": [session.missed for session in self.sessions][:64],
+            "missed_by_connection": sorted((s.missed for s in self.sessions if s.missed), reverse=True)[:16],
             "missed": {name: seat.missed for name, seat in self.tree.seats.items()},
             "refused": {name: seat.refused for name, seat in self.tree.seats.items() if seat.refused},
         }

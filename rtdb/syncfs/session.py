@@ -7,13 +7,14 @@ or returns None for a stat of a clock, which is answered at the next edge. Repli
 import contextlib
 import errno
 import logging
+import os
 import stat
 import struct
 import time
 from collections.abc import Callable
 from typing import Any
 
-from ..errors import RtdbError
+from ..errors import AgedOut, RtdbError
 from .codec import (
     DIR,
     FILE,
@@ -31,7 +32,7 @@ from .codec import (
     encoded_text,
 )
 from .draft import Draft
-from .errors import FsError, errno_of, text_of
+from .errors import FsError, errno_of
 from .nodes import Attr, ClockFile, Directory, File, FreeDir, FreeFile, Node
 from .pace import Pace
 from .past import PastRoot
@@ -47,6 +48,7 @@ OREAD, OWRITE, ORDWR, OEXEC, OTRUNC, OAPPEND = 0, 1, 2, 3, 0x10, 0x80
 DMDIR, DMAPPEND = 0x80000000, 0x40000000
 SPECIAL = 0x02000000 | 0x01000000 | 0x00800000 | 0x00200000 | 0x00100000  # symlink, link, device, fifo, socket
 SET_MODE, SET_UID, SET_GID, SET_SIZE, SET_MTIME, SET_MTIME_TO = 0x1, 0x2, 0x4, 0x8, 0x20, 0x100
+SMALL_BYTES = 1 << 16  # drafts up to this size are not counted
 V9FS_MAGIC, BLOCK, AT_REMOVEDIR = 0x01021997, 4096, 0x200
 KEEP, KEEP_LENGTH = 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF  # of a wstat: leave it
 _ENTRY = struct.Struct("<BIQQB")
@@ -154,14 +156,19 @@ class Session:
     def _error(self, tag: int, code: int) -> bytes:
         if self._dialect is LINUX:
             return LINUX.encode[TYPES["Rlerror"]](tag, code)
-        values = (text_of(code), code) if self._dialect is UNIX else (text_of(code),)
+        values = (os.strerror(code), code) if self._dialect is UNIX else (os.strerror(code),)
         return self._dialect.encode[TYPES["Rerror"]](tag, *values)
 
     def _reply(self, name: str, tag: int, *values: Any) -> bytes:
         return self._dialect.encode[TYPES[name]](tag, *values)
 
+    @property
+    def attached(self) -> bool:
+        """Whether the client holds anything here."""
+        return bool(self._fids)
+
     def edge(self) -> None:
-        """A cycle of the store has begun."""
+        """An edge of the tree's pace has come."""
         for fid in list(self._writing):
             if fid.draft is not None and fid.draft.dirty:
                 try:
@@ -222,7 +229,8 @@ class Session:
         if fid is None:
             raise FsError(errno.EBADF, f"no fid {number}")
         self._writing.pop(fid, None)
-        if fid.draft is not None:
+        gone = isinstance(fid.node, FreeFile) and fid.node.gone  # what was written goes with it
+        if fid.draft is not None and not gone:
             fid.draft.finish()
 
     # -- messages of all dialects ---------------------------------------------------------------------------------
@@ -315,9 +323,20 @@ class Session:
         if fid.draft is None or fid.opened == OREAD:
             raise FsError(errno.EBADF, "this fid is not open for writing")
         assert isinstance(fid.node, File)
-        self._tree.room_for(fid.node, len(data) if fid.draft.append else offset + len(data))
+        end = len(data) if fid.draft.append else offset + len(data)
+        self._tree.room_for(fid.node, end)
+        if end > SMALL_BYTES:
+            self._check_drafts(end - fid.draft.n_bytes)
         fid.draft.write(offset, data)
         return self._reply("Rwrite", tag, len(data))
+
+    def _check_drafts(self, n_bytes: int) -> None:
+        """Refuse what would make the unfinished revisions of this connection too large together."""
+        if (
+            sum(fid.draft.n_bytes for fid in self._writing if fid.draft is not None) + n_bytes
+            > self._limits.draft_bytes
+        ):
+            raise FsError(errno.ENOSPC, f"unfinished revisions may take {self._limits.draft_bytes} bytes together")
 
     def _clunk(self, tag: int, number: int) -> bytes:
         self._drop(number)
@@ -349,6 +368,8 @@ class Session:
                 raise FsError(errno.EISDIR)
             assert isinstance(node, File)
             node.check_write(fid.who)
+            if len(self._writing) >= self._limits.writing:
+                raise FsError(errno.EMFILE, f"{self._limits.writing} files are open for writing")
             fid.draft = Draft(
                 node.base,
                 lambda data: node.commit(data, fid.who),
@@ -496,6 +517,8 @@ class Session:
             raise FsError(errno.EISDIR)
         node.check_write(fid.who)
         self._tree.room_for(node, size)
+        if size > SMALL_BYTES:
+            self._check_drafts(size)
         if fid.draft is not None:
             fid.draft.truncate(size)
             return
@@ -537,7 +560,7 @@ class Session:
         if offset == 0 or not isinstance(fid.listing, bytes):
             cycle = self._cycle(fid)
             fid.listing = b"".join(
-                self._stat_bytes(entry, name, entry.attr(cycle, fid.who)) for name, entry in node.entries(cycle)
+                self._stat_bytes(entry, name, self._attr(entry, cycle, fid.who)) for name, entry in node.entries(cycle)
             )
         end = offset
         while end < len(fid.listing):
@@ -548,6 +571,14 @@ class Session:
         if end == offset < len(fid.listing):
             raise FsError(errno.EINVAL, "no room for one entry")
         return fid.listing[offset:end]
+
+    @staticmethod
+    def _attr(node: Node, cycle: int, who: Who) -> Attr:
+        """Tell about an entry of a directory, also if what it holds has aged out."""
+        try:
+            return node.attr(cycle, who)
+        except AgedOut:
+            return Attr(stat.S_IFREG | 0o444, 0, 0, 0)
 
     def _stat_bytes(self, node: Node, name: str, attr: Attr) -> bytes:
         mode = attr.mode & 0o777 | (DMDIR if stat.S_ISDIR(attr.mode) else 0)

@@ -81,6 +81,9 @@ class StatusView:
     @staticmethod
     def _value(obj: Object[Any], cycle: int) -> Any:
         try:
+            if is_json(obj.stored.fields):
+                raw = obj._store.core.visible(obj.handle, cycle)
+                return None if raw is None else msgspec.Raw(raw[0].partition(b"\0")[0])
             sample = obj.visible(cycle)
         except UNREADABLE:
             return None

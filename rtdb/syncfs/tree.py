@@ -21,7 +21,7 @@ from typing import Any
 
 from ..clock import Kind
 from ..components import ComponentInfo
-from ..errors import AgedOut, RtdbError
+from ..errors import AgedOut, InUse, RtdbError
 from ..json_object import is_json
 from ..objects import Object
 from ..store import Store
@@ -68,7 +68,13 @@ class Tree:
         patience_s: float = 5.0,
     ) -> None:
         self.store, self.pace, self.limits = store, pace or Pace(), limits or Limits()
-        self.component = store.join(FILES)
+        try:
+            self.component = store.join(FILES)
+        except InUse as error:
+            pid = next(info.pid for info in store.components() if info.name == FILES)
+            raise InUse(
+                f"store {store.name!r} is served already, by process {pid}: one server has several --listen"
+            ) from error
         self.seats = {spec.component: Seat(store, spec, patience_s) for spec in seats}
         self.report: Callable[[], dict[str, Any]] = dict
         self._version = -1
@@ -131,7 +137,7 @@ class Tree:
         }
 
     def _wall_ns(self, cycle: int) -> int:
-        """Give the wall time of an edge, the same whenever it is asked for."""
+        """Give the wall time of an edge, the same for all who ask for it soon."""
         known = self._walls.get(cycle)
         if known is None:
             now = self.store.now_ns
@@ -333,6 +339,8 @@ class Tree:
         if old is not None:
             if old.is_dir != node.is_dir:
                 raise FsError(errno.EISDIR if old.is_dir else errno.ENOTDIR, f"{new} is of another kind")
+            if isinstance(old, FreeFile) and isinstance(node, FreeFile):
+                node.data.follow(old.data)
             self.remove(to, new)
         del parent.children[name]
         node.name, node.parent = new, to

@@ -31,10 +31,12 @@ class Waiting:
         self._of.setdefault(pace, {})[key] = waiter
         self._pace_of[key] = pace
 
-    def cancel(self, key: Hashable) -> bool:
-        """Forget a stat; says whether it was held."""
+    def cancel(self, key: Hashable) -> None:
+        """Forget a stat, if it is held."""
         pace = self._pace_of.pop(key, None)
-        return pace is not None and self._of[pace].pop(key, None) is not None
+        waiter = None if pace is None else self._of[pace].pop(key, None)
+        if waiter is not None and waiter.seat is not None:
+            waiter.seat.give_up()
 
     def edge(self, cycle: int) -> None:
         """Answer those whose edge has come."""

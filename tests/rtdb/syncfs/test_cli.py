@@ -1,5 +1,6 @@
 """`fairway serve` and `fairway fs`: real processes, as people type them."""
 
+import errno
 import json
 import os
 import re
@@ -101,7 +102,7 @@ def test_files_without_a_mount(serve, fairway, unique):
         (("cat", "/at"), "/at: Is a directory"),
         (("write", "/clock", "1"), "/clock: Permission denied"),
         (("write", "/at/0/x", "1"), "/at/0/x: "),
-        (("ls", "/", "--token", "guess"), "Permission denied"),
+        (("ls", "/", "--token", "guess"), "knows no such token"),
         (("write", "/shell/status", "no JSON", "--token", "secret"), "/shell/status: Invalid argument; /shell/health"),
     ],
 )
@@ -222,3 +223,32 @@ def test_mount_commands_name_their_transport():
     assert Address.parse("tcp:[::1]:77").is_local
     with pytest.raises(FsError):
         Address.parse("udp:127.0.0.1:1")
+
+
+def test_an_ordinary_file_in_the_place_of_the_socket_is_kept(fairway, unique, tmp_path):
+    precious = tmp_path / "precious.txt"
+    precious.write_text("mine")
+    done = fairway("serve", "--db", unique(), "--listen", f"unix:{precious}")
+    assert done.returncode == 2
+    assert "is no socket" in done.stderr
+    assert precious.read_text() == "mine"
+
+
+def test_a_server_ends_with_its_store(serve, unique):
+    db = unique()
+    with Store.create(db, clock="real", size=32 << 20) as store:
+        store.run_clock()
+        process, _ = serve("--db", db)
+    assert "has ended, and so does its file server" in process.communicate()[1]
+    assert process.returncode == 0
+
+
+def test_a_client_that_ran_into_its_time_limit_is_closed(serve, unique, tmp_path):
+    address = f"unix:{tmp_path}/s"
+    serve("--db", unique(), "--clock", "barrier", "--listen", address, "--component", "never")
+    client = Client.connect(address, timeout_s=0.01)
+    with pytest.raises(FsError) as caught:
+        client.wait()
+    assert caught.value.errno == errno.ETIMEDOUT
+    with pytest.raises(FsError):
+        client.ls()

@@ -16,6 +16,8 @@ import pytest
 from rtdb import Record, Store
 from rtdb.json_object import json_schema
 from rtdb.objects import Flag
+from rtdb.recorder import Recorder
+from rtdb.recording import Recording
 from rtdb.records import f8, image
 from rtdb.syncfs import OPERATOR, FsError, SeatSpec, Tokens
 
@@ -1184,3 +1186,80 @@ def test_the_server_says_how_it_does_however_many_scripts_there_are(make_rig):
 def test_no_answer_needs_another_thread(rig, fs):
     assert fs.read("clock")
     assert [t.name for t in threading.enumerate() if t.name == "edges"] == []
+
+
+# -- what a review found ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["flush", "hang up"])
+def test_who_gives_up_waiting_is_not_waited_for_for_ever(seated, how):
+    rig, fs, other = seated, seated.client(token="token-of-look"), seated.client(token="token-of-look")
+    tag = fs.stat("look/clock")
+    rig.edge()
+    fs.told(tag)
+    tag = other.stat("look/clock")
+    rig.stand(60.0)
+    assert alive(rig, "look"), "who waits is waited for"
+    if how == "flush":
+        other.call("Tflush", tag)
+    else:
+        other.hang_up()
+    rig.stand(60.0)
+    assert not alive(rig, "look")
+
+
+def alive(rig, component):
+    return next(info.alive for info in rig.store.components() if info.name == component)
+
+
+def test_what_was_held_back_is_not_said_by_a_successor(seated):
+    rig, fs = seated, seated.client(token="token-of-look")
+    fid = fs.open("look/status", O_WRONLY)
+    for n in range(100):  # more than the ring holds
+        fs.pwrite(fid, b'{"n": %d}' % n)
+    fs.hang_up()
+    rig.edge(2)
+    before = rig.store.find("look/status").head
+    again = rig.client(token="token-of-look")
+    rig.edge(3)
+    assert rig.store.find("look/status").head == before
+    again.hang_up()
+
+
+def test_a_file_moved_onto_another_shows_the_old_content_until_the_edge(rig, fs):
+    fs.write("f", b"old")
+    rig.edge()
+    fs.write("g", b"new")
+    fs.mv("g", "f")
+    assert fs.read("f") == b"old"
+    rig.edge()
+    assert fs.read("f") == b"new"
+    rig.edge()
+    fs.write("empty", b"")
+    fs.mv("empty", "f")
+    rig.edge()
+    assert fs.read("f") == b""
+
+
+def test_free_files_are_in_the_recording(make_rig, tmp_path):
+    rig = make_rig(shared=True)
+    fs, sizes = rig.client(), (0, 1, 255, 256, 257, 300, 100_000)
+    with Recorder(tmp_path / "run.mcap", [rig.store], {}) as recorder:
+        for n in sizes:
+            fs.write(f"f{n}", bytes(n))
+        for _ in range(20):
+            rig.tick()
+            recorder.record()
+    found = Recording(tmp_path / "run.mcap")
+    assert found.last_cycle == EVERY, "they showed at the edge"
+
+
+def test_a_script_that_follows_a_module_is_not_taken_for_it(seated):
+    rig = seated
+    was = rig.store.join("follow")
+    was.insert("pose", Pose).write(Pose())
+    rig.edge()
+    was.leave()
+    rig.client(token="token-of-follow")
+    rig.edge()
+    assert [obj.name for obj in rig.store.objects("follow/*")] == ["follow/health", "follow/config", "follow/status"]
