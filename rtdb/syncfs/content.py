@@ -18,8 +18,8 @@ from ..records import Record, Schema
 from ..store import Store
 from .pace import Pace
 
-RING_BYTES = 32 << 10  # of a file's slots, as long as that is enough for a few
-LEAST_SLOTS, MOST_SLOTS = 6, 100
+RING_BYTES = 8 << 10  # of a file's slots, as long as that is enough for a few
+LEAST_SLOTS, MOST_SLOTS = 6, 24
 LEAST_BYTES = 256
 SHARE = 0.5  # of the store's memory is for free files, at most: components need the rest
 KEPT = 1000  # so many handles of deleted objects are not looked through

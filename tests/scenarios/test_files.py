@@ -78,6 +78,7 @@ def test_a_script_steers_the_cart_around_the_square(square: Scenario, by_python:
     assert result.verdict == "PASS", result
 
 
+@pytest.mark.proof
 def test_a_drive_by_a_script_is_the_same_to_the_byte_when_it_is_repeated(
     square: Scenario, tmp_path: Path, by_python: Recording
 ) -> None:
@@ -85,6 +86,7 @@ def test_a_drive_by_a_script_is_the_same_to_the_byte_when_it_is_repeated(
     assert again.trace_hash() == by_python.trace_hash()
 
 
+@pytest.mark.proof
 def test_the_component_in_javascript_drives_as_that_in_python(
     square: Scenario, tmp_path: Path, by_python: Recording
 ) -> None:

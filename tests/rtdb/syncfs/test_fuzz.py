@@ -18,6 +18,7 @@ from .conftest import ROOT, Refused, Rig
 
 FLUSH, VERSION = TYPES["Tflush"], TYPES["Tversion"]
 COLUMN = {"9P2000": 1, "9P2000.u": 2, "9P2000.L": 3}
+pytestmark = pytest.mark.proof  # half a minute
 fuzzed = settings(deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), max_examples=150)
 
 
