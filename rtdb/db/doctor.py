@@ -181,7 +181,7 @@ OTHERS = (  # what our imports, and theirs, are called; tests/rtdb/test_doctor.p
     "filterpy", "fontTools", "google", "gymnasium", "kiwisolver", "lz4", "matplotlib", "mcap", "msgspec", "numpy",
     "packaging", "pyarrow", "pybullet", "pybullet_data", "pydantic", "pydantic_core", "pygeomag", "pygments",
     "pyparsing", "pytest", "rerun", "rich", "ruamel", "scipy", "shellingham", "six", "stable_baselines3", "torch",
-    "typer", "typing_extensions", "typing_inspection", "annotated_types", "zstandard",
+    "typer", "typing_extensions", "typing_inspection", "annotated_types", "uvloop", "zstandard",
 )  # fmt: skip
 
 

@@ -8,16 +8,13 @@ import contextlib
 import errno
 import logging
 import os
-import stat
 import struct
 import time
 from collections.abc import Callable
 from typing import Any
 
-from ..errors import AgedOut, RtdbError
+from ..errors import RtdbError
 from .codec import (
-    DIR,
-    FILE,
     HEADER,
     IO_HEADER,
     LINUX,
@@ -29,15 +26,14 @@ from .codec import (
     Malformed,
     Qid,
     dialect_for,
-    encoded_text,
 )
 from .draft import Draft
 from .errors import FsError, errno_of
-from .nodes import Attr, ClockFile, Directory, File, FreeDir, FreeFile, Node
+from .nodes import ClockFile, Directory, File, FreeDir, FreeFile, Node
 from .pace import Pace
-from .past import PastRoot
 from .policy import Tokens, Who
 from .seats import Seat
+from .stats import DMDIR, Wstat, attr_or_aged, entry_rows, name_of, qid_of, stat_record, whole_stats
 from .tree import Tree
 from .waiting import Waiter, Waiting
 
@@ -45,14 +41,11 @@ log = logging.getLogger(__name__)
 BASIC, ALL = 0x7FF, 0x3FFF  # masks of getattr: a look while walking, and a stat
 O_ACCESS, O_EXCL, O_TRUNC, O_APPEND, O_DIRECTORY = 0o3, 0o200, 0o1000, 0o2000, 0o200000
 OREAD, OWRITE, ORDWR, OEXEC, OTRUNC, OAPPEND = 0, 1, 2, 3, 0x10, 0x80
-DMDIR, DMAPPEND = 0x80000000, 0x40000000
+DMAPPEND = 0x40000000
 SPECIAL = 0x02000000 | 0x01000000 | 0x00800000 | 0x00200000 | 0x00100000  # symlink, link, device, fifo, socket
 SET_MODE, SET_UID, SET_GID, SET_SIZE, SET_MTIME, SET_MTIME_TO = 0x1, 0x2, 0x4, 0x8, 0x20, 0x100
 SMALL_BYTES = 1 << 16  # drafts up to this size are not counted
 V9FS_MAGIC, BLOCK, AT_REMOVEDIR = 0x01021997, 4096, 0x200
-KEEP, KEEP_LENGTH = 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF  # of a wstat: leave it
-_ENTRY = struct.Struct("<BIQQB")
-_STAT = struct.Struct("<HIBIQIIIQ")
 
 
 class Fid:
@@ -66,6 +59,11 @@ class Fid:
         self.pinned: bytes | None = None  # the revision that is being read
         self.listing: list[tuple[str, Node]] | bytes | None = None  # of a directory that is being read
         self.draft: Draft | None = None
+
+
+def is_gone(node: Node) -> bool:
+    """Whether a file was removed while somebody has it open."""
+    return isinstance(node, FreeFile) and node.gone
 
 
 class Session:
@@ -221,7 +219,7 @@ class Session:
             version = pace.count(pace.last(cycle))
         else:
             version = fid.pace.last(cycle)
-        return Qid(DIR if node.is_dir else FILE, version & 0xFFFFFFFF, node.path)
+        return qid_of(node, version)
 
     def _drop(self, number: int) -> None:
         """Clunk: the draft is finished, the fid is gone whatever comes of it."""
@@ -229,8 +227,7 @@ class Session:
         if fid is None:
             raise FsError(errno.EBADF, f"no fid {number}")
         self._writing.pop(fid, None)
-        gone = isinstance(fid.node, FreeFile) and fid.node.gone  # what was written goes with it
-        if fid.draft is not None and not gone:
+        if fid.draft is not None and not is_gone(fid.node):  # what was written goes with it
             fid.draft.finish()
 
     # -- messages of all dialects ---------------------------------------------------------------------------------
@@ -323,6 +320,8 @@ class Session:
         if fid.draft is None or fid.opened == OREAD:
             raise FsError(errno.EBADF, "this fid is not open for writing")
         assert isinstance(fid.node, File)
+        if is_gone(fid.node):
+            raise FsError(errno.ENOENT, "it was removed")
         end = len(data) if fid.draft.append else offset + len(data)
         self._tree.room_for(fid.node, end)
         if end > SMALL_BYTES:
@@ -450,12 +449,9 @@ class Session:
         s, ns = divmod(attr.mtime_ns, 1_000_000_000)
         blocks = (attr.size + 511) // 512
         return self._reply(
-            "Rgetattr", tag, ALL, self._qid_of(fid.node, attr), attr.mode, attr.uid, attr.gid,
+            "Rgetattr", tag, ALL, qid_of(fid.node, attr.version), attr.mode, attr.uid, attr.gid,
             2 if fid.node.is_dir else 1, 0, attr.size, BLOCK, blocks, s, ns, s, ns, s, ns, 0, 0, 0, attr.version,
         )  # fmt: skip
-
-    def _qid_of(self, node: Node, attr: Attr) -> Qid:
-        return Qid(DIR if node.is_dir else FILE, attr.version & 0xFFFFFFFF, node.path)
 
     def _hold(self, tag: int, fid: Fid, clock: ClockFile, made: Callable[[], bytes]) -> None:
         """Hold a stat of a clock until the next edge: of the clock's own pace, or that of the mount."""
@@ -541,102 +537,43 @@ class Session:
         cycle = self._cycle(fid)
         if offset == 0 or not isinstance(fid.listing, list):
             fid.listing = [(".", node), ("..", node.parent or node), *node.entries(cycle)]
-        count, size = min(count, self._msize - IO_HEADER), 0
-        out: list[bytes] = []
-        for k in range(offset, len(fid.listing)):
-            name, entry = fid.listing[k]
-            kind = (DIR, 4) if entry.is_dir else (FILE, 8)
-            row = _ENTRY.pack(kind[0], cycle & 0xFFFFFFFF, entry.path, k + 1, kind[1]) + encoded_text(name)
-            size += len(row)
-            if size > count:
-                if not out:
-                    raise FsError(errno.EINVAL, "no room for one entry")
-                break
-            out.append(row)
-        return self._reply("Rreaddir", tag, b"".join(out))
+        rows = entry_rows(fid.listing, offset, cycle, min(count, self._msize - IO_HEADER))
+        return self._reply("Rreaddir", tag, rows)
 
     def _stats_of(self, fid: Fid, node: Directory, offset: int, count: int) -> bytes:
         """Give whole stats of a directory's entries, as the older dialects read them."""
         if offset == 0 or not isinstance(fid.listing, bytes):
             cycle = self._cycle(fid)
             fid.listing = b"".join(
-                self._stat_bytes(entry, name, self._attr(entry, cycle, fid.who)) for name, entry in node.entries(cycle)
+                stat_record(self._dialect, entry, name, attr_or_aged(entry, cycle, fid.who))
+                for name, entry in node.entries(cycle)
             )
-        end = offset
-        while end < len(fid.listing):
-            size = 2 + int.from_bytes(fid.listing[end : end + 2], "little")
-            if end + size - offset > count:
-                break
-            end += size
-        if end == offset < len(fid.listing):
-            raise FsError(errno.EINVAL, "no room for one entry")
-        return fid.listing[offset:end]
-
-    @staticmethod
-    def _attr(node: Node, cycle: int, who: Who) -> Attr:
-        """Tell about an entry of a directory, also if what it holds has aged out."""
-        try:
-            return node.attr(cycle, who)
-        except AgedOut:
-            return Attr(stat.S_IFREG | 0o444, 0, 0, 0)
-
-    def _stat_bytes(self, node: Node, name: str, attr: Attr) -> bytes:
-        mode = attr.mode & 0o777 | (DMDIR if stat.S_ISDIR(attr.mode) else 0)
-        qid, s = self._qid_of(node, attr), (attr.mtime_ns // 1_000_000_000) & 0xFFFFFFFF
-        body = _STAT.pack(0, 0, *qid, mode, s, s, 0 if node.is_dir else attr.size)
-        body += encoded_text(name) + encoded_text(str(attr.uid)) + encoded_text(str(attr.gid)) + encoded_text("")
-        if self._dialect is UNIX:
-            body += encoded_text("") + struct.pack("<III", attr.uid, attr.gid, NO_UID)
-        return struct.pack("<H", len(body)) + body
+        return whole_stats(fid.listing, offset, count)
 
     def _stat(self, tag: int, number: int) -> bytes | None:
         fid = self._fid(number)
 
         def made() -> bytes:
             attr = fid.node.attr(self._shown(fid), fid.who)
-            return self._reply("Rstat", tag, self._stat_bytes(fid.node, self._name_of(fid.node), attr))
+            return self._reply("Rstat", tag, stat_record(self._dialect, fid.node, name_of(fid.node), attr))
 
         if isinstance(fid.node, ClockFile):
             self._hold(tag, fid, fid.node, made)
             return None
         return made()
 
-    def _name_of(self, node: Node) -> str:
-        if isinstance(node, FreeFile | FreeDir):
-            return node.name or "/"
-        if node.parent is None or node.parent is node:
-            return "/"
-        if isinstance(node, PastRoot):
-            return str(node.at)
-        return next((name for name, other in node.parent.entries(0) if other.path == node.path), "/")
-
     def _wstat(self, tag: int, number: int, record: bytes) -> bytes:
         fid = self._fid(number)
-        _, _, _, _, _, mode, _, mtime, length = _STAT.unpack_from(record, 2)
-        texts, at = [], 2 + _STAT.size
-        for _ in range(4):
-            (n,) = struct.unpack_from("<H", record, at)
-            texts.append(record[at + 2 : at + 2 + n].decode("utf-8", "surrogateescape"))
-            at += 2 + n
-        uid = gid = KEEP
-        if self._dialect is UNIX:
-            (n,) = struct.unpack_from("<H", record, at)
-            uid, gid, _ = struct.unpack_from("<III", record, at + 2 + n)
-        if length != KEEP_LENGTH:
-            self._truncate(fid, length)
-        if mode != KEEP or mtime != KEEP or uid != KEEP or gid != KEEP:
-            self._tree.set_attr(
-                fid.node,
-                mode=None if mode == KEEP else mode & 0o777,
-                uid=None if uid == KEEP else uid,
-                gid=None if gid == KEEP else gid,
-                mtime_ns=None if mtime == KEEP or length != KEEP_LENGTH else mtime * 1_000_000_000,
-            )
-        if fid.draft is not None and not texts[0] and {mode, mtime, uid, gid} == {KEEP} and length == KEEP_LENGTH:
-            fid.draft.sync()  # a wstat that changes nothing is an fsync
-        name = texts[0]
-        if name and name != self._name_of(fid.node):
-            self._rename_node(fid.node, fid.node.parent, name.rpartition("/")[2])
+        asked = Wstat.parse(self._dialect, record)
+        if asked.length is not None:
+            self._truncate(fid, asked.length)
+        if not asked.attributes_are_kept:
+            mtime_ns = asked.mtime_ns if asked.length is None else None
+            self._tree.set_attr(fid.node, mode=asked.mode, uid=asked.uid, gid=asked.gid, mtime_ns=mtime_ns)
+        if fid.draft is not None and asked.is_empty:
+            fid.draft.sync()
+        if asked.name and asked.name != name_of(fid.node):
+            self._rename_node(fid.node, fid.node.parent, asked.name)
         return self._reply("Rwstat", tag)
 
     def _rename_node(self, node: Node, to: Node | None, name: str) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
@@ -22,11 +23,19 @@ class File:
 
     def __init__(self):
         self.shown = self.newest = b""
-        self.gone = False
+        self.gone = self.committed = self.seen = False  # seen: an edge has shown a revision of it
 
     def commit(self, data):
         if not self.gone:
-            self.newest = data
+            self.newest, self.committed = data, True
+
+    def edge(self):
+        self.shown, self.seen = self.newest, self.committed
+
+    def replace(self, other):
+        """Take another's place: until it is seen itself, what that one showed."""
+        if not self.seen:
+            self.shown, self.committed = other.shown, True
 
 
 class Handle:
@@ -137,6 +146,7 @@ class FilesMachine(RuleBasedStateMachine):
         if code is None and there is not node:
             if isinstance(there, File):
                 there.gone = True
+                node.replace(there)
             del directory[old]
             to[new] = node
 
@@ -182,6 +192,10 @@ class FilesMachine(RuleBasedStateMachine):
     @rule(k=indices, data=contents.filter(len))
     def write(self, k, data):
         handle = self.writers()[k % len(self.writers())]
+        if handle.file.gone:
+            with pytest.raises(Refused):
+                handle.session.pwrite(handle.fid, data, len(handle.draft))
+            return
         if handle.synced:
             handle.session.truncate(handle.fid, 0)
             handle.draft, handle.synced = b"", False
@@ -193,7 +207,7 @@ class FilesMachine(RuleBasedStateMachine):
     def overwrite(self, k, back):
         handle = self.writers()[k % len(self.writers())]
         at = len(handle.draft) - back
-        if handle.synced or at <= 0:
+        if handle.synced or at <= 0 or handle.file.gone:
             return
         handle.session.pwrite(handle.fid, b"*", at)
         handle.draft, handle.dirty = handle.draft[:at] + b"*" + handle.draft[at + 1 :], True
@@ -202,6 +216,11 @@ class FilesMachine(RuleBasedStateMachine):
     @rule(k=indices)
     def fsync(self, k):
         handle = self.writers()[k % len(self.writers())]
+        if handle.file.gone and handle.dirty:
+            with pytest.raises(Refused):
+                handle.session.fsync(handle.fid)
+            handle.dirty = False
+            return
         handle.session.fsync(handle.fid)
         if handle.dirty:
             handle.file.commit(handle.draft)
@@ -248,7 +267,7 @@ class FilesMachine(RuleBasedStateMachine):
 
     def shows(self):
         for _, file in self.files():
-            file.shown = file.newest
+            file.edge()
         self.past[self.store.cycle] = {path: file.shown for path, file in self.files()}
 
     @precondition(lambda self: self.past)

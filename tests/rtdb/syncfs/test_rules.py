@@ -812,7 +812,7 @@ def test_a_name_made_anew_is_another_file(rig, fs):
     fs.rm("f")
     fs.write("f", b"new")
     assert fs.look("f")["qid"].path != number
-    fs.pwrite(fid, b"to the old one")
+    assert refused(fs.pwrite, fid, b"to the old one") == errno.ENOENT
     fs.clunk(fid)
     rig.edge()
     assert fs.read("f") == b"new"
