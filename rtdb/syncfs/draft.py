@@ -130,7 +130,7 @@ class Draft:
 
     def sync(self) -> None:
         """Make what there is a revision, and go on: a later close adds nothing by itself."""
-        self.truncated = False
+        self.truncated, self._kept = False, True
         self.finish()
 
     def edge(self) -> None:
@@ -147,5 +147,5 @@ class Draft:
 
     @property
     def pristine(self) -> bool:
-        """Whether nothing was begun."""
-        return not self.dirty and not self._ended and not self._data
+        """Whether the file was opened just now: nothing was begun, nor finished."""
+        return not (self.dirty or self._ended or self._data or self._kept)

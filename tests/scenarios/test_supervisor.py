@@ -107,6 +107,7 @@ def test_ticks_that_were_slept_through_are_made_up_for_unless_the_safety_node_wo
 # -- processes ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.proof
 def test_a_drive_arrives_in_real_time_restarts_who_is_not_needed_and_leaves_nothing_behind(live, tmp_path):
     stack = json.loads((STACKS / "reference.json").read_text())
     stack["watcher"] = {

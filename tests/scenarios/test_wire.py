@@ -17,6 +17,7 @@ from scenarios.latency import latency
 from scenarios.rewire import Change, changed, check_change, propose, stack_of
 
 STACKS = Path(__file__).resolve().parents[2] / "autonomy" / "stacks"
+pytestmark = pytest.mark.proof  # a run in real time
 
 
 @pytest.fixture(scope="module")
