@@ -25,7 +25,7 @@ class Draft:
     """
 
     __slots__ = (
-        "_base", "_commit", "_data", "_ended", "_is_whole", "_kept", "_most", "_piece", "_single", "_tail",
+        "_base", "_commit", "_data", "_ended", "_is_whole", "_kept", "_most", "_piece", "_single", "_synced", "_tail",
         "append", "dirty", "idle", "truncated",
     )  # fmt: skip
 
@@ -46,6 +46,7 @@ class Draft:
         self._tail = bytearray()  # what is appended to the newest revision, whatever that is by then
         self._ended = 0  # writes of this revision that have come to their end
         self._single = self._kept = False  # the revision before, through this descriptor, was one write; there was one
+        self._synced = False  # its user says by fsync what is whole
         self.truncated = created and not append  # this one began with a truncation: the close ends it
         self.dirty = False
         self.idle = False  # an edge has passed since the last write
@@ -101,11 +102,17 @@ class Draft:
 
     def _show(self, data: bytearray) -> None:
         """Make a write that has ended a revision, if it is one."""
-        if self.truncated and not self._kept:
+        if self._waits_for_close:
             return
         whole = self._is_whole(data)
         if whole or (whole is None and self._single):
             self.finish()
+
+    @property
+    def _waits_for_close(self) -> bool:
+        """Whether only fsync and the close end this revision: it began with a truncation, by one who does not keep the
+        file open to write it again and again, or who says by fsync what is whole."""
+        return self.truncated and (self._synced or not self._kept)
 
     def _end_before(self) -> None:
         """A new revision begins: the one before is finished. What was wrong with it is not the new one's fault."""
@@ -130,12 +137,12 @@ class Draft:
 
     def sync(self) -> None:
         """Make what there is a revision, and go on: a later close adds nothing by itself."""
-        self.truncated, self._kept = False, True
+        self.truncated, self._synced = False, True
         self.finish()
 
     def edge(self) -> None:
         """Note an edge: what was begun without a truncation, and left alone for a whole cycle, counts as finished."""
-        if self.dirty and (self._kept or not self.truncated):
+        if self.dirty and not self._waits_for_close:
             if self.idle or self._tail:
                 self.finish()
             self.idle = True
@@ -148,4 +155,4 @@ class Draft:
     @property
     def pristine(self) -> bool:
         """Whether the file was opened just now: nothing was begun, nor finished."""
-        return not (self.dirty or self._ended or self._data or self._kept)
+        return not (self.dirty or self._ended or self._data or self._synced)
