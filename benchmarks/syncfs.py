@@ -12,6 +12,7 @@ import argparse
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import shutil
 import socket
@@ -144,8 +145,8 @@ def ops(folder: Path) -> None:
             with socket.socket() as free:
                 free.bind(("127.0.0.1", 0))
                 port = free.getsockname()[1]
-            mine = f"unix:{folder}/s" if kind == "unix" else f"tcp:127.0.0.1:{port}"
-            theirs = f"unix:{folder}/e" if kind == "unix" else f"tcp:127.0.0.1:{port + 1}"
+            mine = f"unix:{folder}/s{plain}" if kind == "unix" else f"tcp:127.0.0.1:{port}"
+            theirs = f"unix:{folder}/e{plain}" if kind == "unix" else f"tcp:127.0.0.1:{port + 1}"
             with server("serve_ops", mine, plain), server("serve_echo", theirs, plain):
                 with Client.connect(mine) as client:
                     client.write("/notes", bytes(BYTES))
@@ -169,6 +170,7 @@ def ops(folder: Path) -> None:
 
 
 def serve_edges(address: str, clock: str, tick_ns: int, every: int, names: list[str], fifo: bool) -> None:
+    logging.disable(logging.WARNING)  # clients that have ended
     got = realtime() if fifo else None
     with Store.create(f"bench-{os.getppid()}", clock=clock, tick_ns=tick_ns, size=64 << 20) as store:
         seats = [SeatSpec(component=n, every=every, phase=0, latency_cycles=every - 1) for n in names]
