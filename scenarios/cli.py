@@ -13,8 +13,8 @@ from rtdb.cli import app as db_app
 from rtdb.syncfs.cli import register as register_files
 
 from .cli_regression import register as register_regression
+from .cli_running import Listen, Token, Use, tokens_of
 from .cli_running import register as register_running
-from .cli_running import tokens_of
 from .folder import Interrupted
 
 if TYPE_CHECKING:
@@ -56,16 +56,9 @@ def drive(
         str, typer.Option(help="none, mild or wide: friction, load, lags, sensor errors from the seed.")
     ] = "none",
     out: Annotated[Path, typer.Option(help="Folder for runs.")] = Path("runs"),
-    use: Annotated[
-        list[str] | None,
-        typer.Option(help="COMPONENT=FILE.py:Class swaps one module of the stack; COMPONENT=files: a script is it."),
-    ] = None,
-    listen: Annotated[
-        str | None, typer.Option(help="Where scripts find the file server, such as tcp:127.0.0.1:5640.")
-    ] = None,
-    token: Annotated[
-        list[str] | None, typer.Option(metavar="COMPONENT=TOKEN", help="A script's token, instead of one by chance.")
-    ] = None,
+    use: Use = None,
+    listen: Listen = None,
+    token: Token = None,
     db: Annotated[
         str | None, typer.Option(help="Put the store where `fairway db` in another terminal sees it.")
     ] = None,
@@ -109,14 +102,13 @@ def drive(
         raise ModuleError(f"{scenario} is a module; put it into a stack with --use COMPONENT=FILE.py:Class")
     plan = load_scenario(scenario)
     stack = stack_with(plan.stack_path(), use or [])
-    if listen is not None and not any(wire.is_files for wire in stack.wires):
-        raise typer.BadParameter("no component is a script; --use COMPONENT=files makes one", param_hint="--listen")
+    tokens = tokens_of(stack, listen, token or [])
     folder = out / plan.id / str(seed)
     folder.mkdir(parents=True, exist_ok=True)
     setup = Setup(
         scenario=plan, seed=seed, stack=stack, db=db, by_hand=by_hand, shuffle=shuffle, faults=folder,
         level=level, plant=plant, randomise=randomise, placement=placement, listen=listen,  # type: ignore[arg-type]
-        tokens=tokens_of(stack, token or []),
+        tokens=tokens,
     )  # fmt: skip
     console = Console()
     if by_hand:

@@ -21,6 +21,15 @@ if TYPE_CHECKING:
 
 PASS, FAIL, BAD_INPUT, BROKEN = 0, 1, 2, 3
 
+Use = Annotated[
+    list[str] | None,
+    typer.Option(help="COMPONENT=FILE.py:Class swaps one module of the stack; COMPONENT=files: a script is it."),
+]
+Listen = Annotated[str | None, typer.Option(help="Where scripts find the file server, such as tcp:127.0.0.1:5640.")]
+Token = Annotated[
+    list[str] | None, typer.Option(metavar="COMPONENT=TOKEN", help="A script's token, instead of one by chance.")
+]
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
@@ -36,16 +45,9 @@ def run(
     scenario: Annotated[
         str, typer.Argument(help="Scenario id (`fairway ls` lists them), or path of a .scenario.yaml.")
     ] = "p545/field-trial",
-    use: Annotated[
-        list[str] | None,
-        typer.Option(help="COMPONENT=FILE.py:Class swaps one module of the stack; COMPONENT=files: a script is it."),
-    ] = None,
-    listen: Annotated[
-        str | None, typer.Option(help="Where scripts find the file server, such as tcp:127.0.0.1:5640.")
-    ] = None,
-    token: Annotated[
-        list[str] | None, typer.Option(metavar="COMPONENT=TOKEN", help="A script's token, instead of one by chance.")
-    ] = None,
+    use: Use = None,
+    listen: Listen = None,
+    token: Token = None,
     seed: Annotated[int, typer.Option(help="Seed of all randomness.", min=0)] = 0,
     level: Annotated[str, typer.Option(help="direct (messages) or wire (true bytes).")] = "wire",
     db: Annotated[str | None, typer.Option("--db", help="Name of the store. Default: run-PROCESS.")] = None,
@@ -71,14 +73,13 @@ def run(
         raise typer.BadParameter(f"{level!r} is not one of direct, wire", param_hint="--level")
     plan = load_scenario(scenario)
     stack = with_whole_paths(stack_with(plan.stack_path(), use or []))
-    if listen is not None and not any(wire.is_files for wire in stack.wires):
-        raise typer.BadParameter("no component is a script; --use COMPONENT=files makes one", param_hint="--listen")
+    tokens = tokens_of(stack, listen, token or [])
     folder = out / plan.id / f"{seed}-real"
     folder.mkdir(parents=True, exist_ok=True)
     setup = RunSetup(
         scenario=plan, stack=stack, folder=folder, db=db or f"run-{os.getpid()}", seed=seed,
         level="direct" if level == "direct" else "wire", for_s=for_s, realtime=realtime, listen=listen,
-        tokens=tokens_of(stack, token or []),
+        tokens=tokens,
     )  # fmt: skip
     raise typer.Exit(_run(setup))
 
@@ -94,9 +95,12 @@ def with_whole_paths(stack: "Stack") -> "Stack":
     return replace(stack, wires=tuple(replace(wire, module=whole(wire.module)) for wire in stack.wires))
 
 
-def tokens_of(stack: "Stack", said: list[str]) -> dict[str, str]:
-    """Read what --token says; only scripts have one."""
-    return tokens_said(said, [wire.component for wire in stack.wires if wire.is_files])
+def tokens_of(stack: "Stack", listen: str | None, said: list[str]) -> dict[str, str]:
+    """Read what --token says; it and --listen are for stacks in which a component is a script."""
+    scripts = [wire.component for wire in stack.wires if wire.is_files]
+    if listen is not None and not scripts:
+        raise typer.BadParameter("no component is a script; --use COMPONENT=files makes one", param_hint="--listen")
+    return tokens_said(said, scripts)
 
 
 def _run(setup: "RunSetup") -> int:

@@ -305,8 +305,9 @@ class Client:
                 self._clunk(fid)
 
     def _clunk(self, fid: int) -> None:
-        self._free.append(fid)
-        self._call("Tclunk", fid)
+        if self._sock.fileno() >= 0:  # else it went with the connection, and why is being said
+            self._free.append(fid)
+            self._call("Tclunk", fid)
 
     def _call(self, name: str, *values: Any, tag: int = 1) -> tuple[Any, ...]:
         number = TYPES[name]

@@ -58,11 +58,6 @@ class Seat:
         self._wrote, self.refused, self.missed = 0, 0, 0
         self._held: bytes | None = None
 
-    @property
-    def taken(self) -> bool:
-        """Whether somebody is the component now."""
-        return self._component is not None
-
     def sit(self, user: object) -> None:
         """A connection attaches as this component. InUse if a process of its own is it."""
         self._users.add(user)

@@ -88,11 +88,9 @@ class Tree:
         self.root = self.names.root
         self.root.parent = self.root
         self.clock = ClockFile(self, CLOCK, self.root, None, None)
-        self.fixed: dict[str, Node] = {
-            "clock": self.clock,
-            "server": ServerFile(self, SERVER, self.root),
-            "at": AtDir(self, AT, self.root),
-        }
+        self._at = AtDir(self, AT, self.root)
+        server = ServerFile(self, SERVER, self.root)
+        self.fixed: dict[str, Node] = {"clock": self.clock, "server": server, "at": self._at}
 
     def close(self) -> None:
         """Leave the store: the free files wait in it for a successor."""
@@ -154,7 +152,7 @@ class Tree:
 
     def past(self, cycle: int) -> PastRoot:
         """Give the tree as a cut showed it."""
-        return PastRoot(self, HISTORY | (cycle & 0x7FFFFFF) << 36, self.fixed["at"], cycle)  # type: ignore[arg-type]
+        return PastRoot(self, HISTORY | (cycle & 0x7FFFFFF) << 36, self._at, cycle)
 
     # -- components -----------------------------------------------------------------------------------------------
 
