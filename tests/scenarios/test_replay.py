@@ -2,7 +2,7 @@
 
 import math
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from ctypes.util import find_library
 from datetime import timedelta
 from http.client import HTTPConnection
@@ -362,7 +362,8 @@ def test_running_drive_shows_what_its_recording_shows(tmp_path: Path, rrd: Path)
         got: dict[str, int] = {}
         deadline = time.monotonic() + 20.0  # the process that writes the file gets it through a socket
         while got != wanted and time.monotonic() < deadline:
-            got = {name: n for name, n in rows(live).items() if name in wanted}
+            with suppress(RuntimeError):  # the last message of the file is half written
+                got = {name: n for name, n in rows(live).items() if name in wanted}
     assert got == wanted
 
 
