@@ -1,6 +1,6 @@
 """The real-time database: typed objects with history, made visible to everybody at once at clock edges."""
 
-from .clock import ClockInfo, Kind, RunningClock
+from .clock import ClockInfo, Edges, Kind, RunningClock
 from .components import Component, ComponentInfo, State
 from .errors import (
     AgedOut,
@@ -40,6 +40,7 @@ __all__ = [
     "Cut",
     "DataTimeBackward",
     "Deleted",
+    "Edges",
     "Flag",
     "Frame",
     "InUse",

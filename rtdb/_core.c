@@ -1,4 +1,4 @@
-/* _core.c - the Python face of fw_rtdb.h: the types Store and Clock. It adds types and exceptions, never logic.
+/* _core.c - the Python face of fw_rtdb.h: the types Store, Clock and Edges. It adds types and exceptions, never logic.
  * Limited API of CPython 3.11: one binary serves every later version. */
 #define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030B0000
@@ -13,6 +13,7 @@
 
 typedef struct { PyObject_HEAD fw_db *db; } Store;
 typedef struct { PyObject_HEAD fw_clock_thread *thread; } Clock;
+typedef struct { PyObject_HEAD fw_edges *thread; } Edges;
 
 /* Raises what rtdb.errors.of makes of a negative errno. */
 static PyObject *fail(int64_t r, const char *call, const char *subject) {
@@ -165,6 +166,10 @@ static PyObject *core_attach(PyObject *module, PyObject *args) {
 
 static PyObject *core_lock_memory(PyObject *Py_UNUSED(module), PyObject *Py_UNUSED(ignored)) { /* errno, 0 when done */
     return PyLong_FromLong(mlockall(MCL_CURRENT | MCL_FUTURE) == 0 ? 0 : errno);
+}
+
+static PyObject *store_bears_name(Store *self, PyObject *Py_UNUSED(ignored)) {
+    return closed(self) ? NULL : PyBool_FromLong(fw_bears_name(self->db));
 }
 
 static PyObject *store_close(Store *self, PyObject *Py_UNUSED(ignored)) {
@@ -674,11 +679,53 @@ static void clock_dealloc(Clock *self) {
     Py_DECREF(type);
 }
 
+/* -- cycles as a file descriptor ------------------------------------------------------------------------------------ */
+
+static PyObject *core_start_edges(PyObject *module, PyObject *args) { /* name, after */
+    const char *name;
+    unsigned long long after;
+    if (!PyArg_ParseTuple(args, "sK", &name, &after)) return NULL;
+    Edges *self = (Edges *)instance(module, "Edges");
+    if (!self) return NULL;
+    int r = fw_edges_start(&self->thread, name, after);
+    if (r == 0) return (PyObject *)self;
+    self->thread = NULL;
+    Py_DECREF(self);
+    return fail(r, "wait for cycles of", name);
+}
+
+static PyObject *edges_fileno(Edges *self, PyObject *Py_UNUSED(ignored)) { return PyLong_FromLong(self->thread ? fw_edges_fd(self->thread) : -1); }
+
+static PyObject *edges_stop(Edges *self, PyObject *Py_UNUSED(ignored)) {
+    fw_edges *thread = self->thread;
+    self->thread = NULL;
+    if (thread) {
+        Py_BEGIN_ALLOW_THREADS
+        fw_edges_stop(thread);
+        Py_END_ALLOW_THREADS
+    }
+    Py_RETURN_NONE;
+}
+
+static PyObject *edges_forget(Edges *self, PyObject *Py_UNUSED(ignored)) { /* in a forked child, which has no such thread */
+    if (self->thread) fw_edges_forget(self->thread);
+    self->thread = NULL;
+    Py_RETURN_NONE;
+}
+
+static void edges_dealloc(Edges *self) {
+    PyTypeObject *type = Py_TYPE((PyObject *)self);
+    if (self->thread) fw_edges_stop(self->thread);
+    freefunc release = (freefunc)PyType_GetSlot(type, Py_tp_free);
+    release(self);
+    Py_DECREF(type);
+}
+
 /* -- module ------------------------------------------------------------------------------------------------------- */
 
 #define METHOD(name, flags) {#name, (PyCFunction)(void (*)(void))store_##name, flags, NULL}
 static PyMethodDef methods[] = {
-    METHOD(close, METH_NOARGS), METHOD(forget, METH_NOARGS), METHOD(save, METH_NOARGS), METHOD(restore, METH_O),
+    METHOD(close, METH_NOARGS), METHOD(bears_name, METH_NOARGS), METHOD(forget, METH_NOARGS), METHOD(save, METH_NOARGS), METHOD(restore, METH_O),
     METHOD(memory, METH_NOARGS), METHOD(join, METH_VARARGS), METHOD(leave, METH_FASTCALL), METHOD(component, METH_FASTCALL),
     METHOD(n_components, METH_NOARGS), METHOD(alive_at, METH_FASTCALL), METHOD(status, METH_VARARGS),
     METHOD(add_schema, METH_VARARGS), METHOD(schema, METH_FASTCALL), METHOD(insert, METH_VARARGS), METHOD(delete, METH_FASTCALL),
@@ -703,8 +750,14 @@ static PyMethodDef clock_methods[] = {{"stop", (PyCFunction)(void (*)(void))cloc
 static PyType_Slot clock_slots[] = {{Py_tp_dealloc, (void *)clock_dealloc}, {Py_tp_methods, clock_methods}, {0, NULL}};
 static PyType_Spec clock_spec = {"rtdb._core.Clock", sizeof(Clock), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, clock_slots};
 
+static PyMethodDef edges_methods[] = {{"fileno", (PyCFunction)(void (*)(void))edges_fileno, METH_NOARGS, NULL},
+                                      {"stop", (PyCFunction)(void (*)(void))edges_stop, METH_NOARGS, NULL},
+                                      {"forget", (PyCFunction)(void (*)(void))edges_forget, METH_NOARGS, NULL}, {NULL, NULL, 0, NULL}};
+static PyType_Slot edges_slots[] = {{Py_tp_dealloc, (void *)edges_dealloc}, {Py_tp_methods, edges_methods}, {0, NULL}};
+static PyType_Spec edges_spec = {"rtdb._core.Edges", sizeof(Edges), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, edges_slots};
+
 static PyMethodDef functions[] = {{"create", core_create, METH_VARARGS, NULL}, {"attach", core_attach, METH_VARARGS, NULL},
-                                  {"start_clock", core_start_clock, METH_VARARGS, NULL},
+                                  {"start_clock", core_start_clock, METH_VARARGS, NULL}, {"start_edges", core_start_edges, METH_VARARGS, NULL},
                                   {"lock_memory", core_lock_memory, METH_NOARGS, NULL}, {NULL, NULL, 0, NULL}};
 static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "rtdb._core", "The store's C core.", -1, functions, NULL, NULL, NULL, NULL};
 
@@ -717,7 +770,7 @@ static int add_type(PyObject *m, const char *name, PyType_Spec *spec) {
 
 PyMODINIT_FUNC PyInit__core(void) {
     PyObject *m = PyModule_Create(&module);
-    if (!m || add_type(m, "Store", &store_spec) < 0 || add_type(m, "Clock", &clock_spec) < 0 ||
+    if (!m || add_type(m, "Store", &store_spec) < 0 || add_type(m, "Clock", &clock_spec) < 0 || add_type(m, "Edges", &edges_spec) < 0 ||
         PyModule_AddStringConstant(m, "SOURCE_HASH", FW_SOURCE_HASH) < 0) { Py_XDECREF(m); return NULL; }
     return m;
 }

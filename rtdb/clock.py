@@ -70,14 +70,47 @@ class RunningClock:
         self.stop()
 
 
+class Edges:
+    """Cycles as a file descriptor, for event loops: readable as each cycle begins, until `clear`.
+
+    A thread of C hears of them, so that none waits for the interpreter. It ends with its `with`, with `close`, or when
+    nobody refers to it.
+    """
+
+    def __init__(self, store_name: str, after: int) -> None:
+        self._core: _core.Edges = _core.start_edges(store_name, after)
+        _running.add(self)
+
+    def fileno(self) -> int:
+        """Give the descriptor, for `select` or a loop's `add_reader`; -1 when it is closed."""
+        return self._core.fileno()
+
+    def clear(self) -> None:
+        """Make it unreadable until the next cycle. Look at the store's cycle behind this, not before."""
+        with contextlib.suppress(BlockingIOError):
+            os.read(self.fileno(), 4096)
+
+    def close(self) -> None:
+        """End it."""
+        self._core.stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
 # A forked child has a copy of the attachment but not the thread: it lets go, so that the clock dies with its process.
-_running: "weakref.WeakSet[RunningClock]" = weakref.WeakSet()
+_running: "weakref.WeakSet[RunningClock | Edges]" = weakref.WeakSet()
 
 
 def _after_fork() -> None:
-    for clock in list(_running):
+    for thread in list(_running):
         with contextlib.suppress(Exception):
-            clock._core.forget()
+            thread._core.forget()
 
 
 os.register_at_fork(after_in_child=_after_fork)

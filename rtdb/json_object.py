@@ -117,10 +117,13 @@ def _finite(literal: str) -> float:
     return value
 
 
+_DECODER = json.JSONDecoder(parse_constant=_finite, parse_float=_finite)
+
+
 def loads(text: str) -> dict[str, Any]:
     """Read one JSON object. NaN and infinity are no JSON."""
     try:
-        document = json.loads(text, parse_constant=_finite, parse_float=_finite)
+        document = _DECODER.decode(text)
     except json.JSONDecodeError as error:
         near = text[max(0, error.pos - 10) : error.pos + 10]
         raise RecordError(f"not JSON: {error.msg} at character {error.pos}, near {near!r}") from error

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from . import _core
 
+LATENCY = "/dev/cpu_dma_latency"
+
 
 @dataclass(frozen=True, slots=True)
 class RealTime:
@@ -19,12 +21,16 @@ class RealTime:
         return not self.refused
 
 
-def realtime(priority: int = 50, cpus: set[int] | None = None, *, lock_memory: bool = True) -> RealTime:
+def realtime(
+    priority: int = 50, cpus: set[int] | None = None, *, lock_memory: bool = True, keep_awake: bool = True
+) -> RealTime:
     """Make this process a real-time one: SCHED_FIFO, memory locked, on given CPUs, its garbage frozen.
 
-    priority: 1..99, higher wins; cpus: where it may run [everywhere it may now]. Everything that is alive now is taken
-    out of garbage collection, and collection is switched off: call `gc.collect()` where there is time for it. Nothing
-    here raises: a laptop gives less than a cart.
+    priority: 1..99, higher wins; cpus: where it may run [everywhere it may now]; keep_awake: no CPU of this machine
+    sleeps while this process lives: it costs power, and one that sleeps wakes late, in a virtual machine by
+    milliseconds at times (benchmarks/wakeup.py). Everything that is alive now is taken out of garbage collection, and
+    collection is switched off: call `gc.collect()` where there is time for it. Nothing here raises: a laptop gives less
+    than a cart.
     """
     got, refused = [], []
     try:
@@ -41,6 +47,13 @@ def realtime(priority: int = 50, cpus: set[int] | None = None, *, lock_memory: b
             refused.append(f"locked memory: {os.strerror(code)}; allow it: `ulimit -l unlimited`")
         else:
             got.append("locked memory")
+    if keep_awake:
+        try:
+            latency = os.open(LATENCY, os.O_WRONLY | os.O_CLOEXEC)  # stays open: the wish ends with this process
+            os.write(latency, bytes(4))  # at most so many us to wake up
+            got.append("awake CPUs")
+        except OSError as error:
+            refused.append(f"awake CPUs: {LATENCY}: {error.strerror}; run as root, or give its group to this user")
     if cpus is not None:
         try:
             os.sched_setaffinity(0, cpus)

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Literal, Self, TypeVar, cast, overload
 
 from . import _core
-from .clock import ClockInfo, Kind, RunningClock
+from .clock import ClockInfo, Edges, Kind, RunningClock
 from .components import Component, ComponentInfo
 from .errors import Deleted, NotOwner, ObjectMissing, RecordError, RtdbError, StoreMissing
 from .objects import Object, Sample, Writer
@@ -292,6 +292,11 @@ class Store:
         kind, alive, pid, cycle, skipped, takeovers, late_ns, lateness_us = self.core.clock_state()
         return ClockInfo(Kind(kind), alive, pid, cycle, skipped, takeovers, late_ns, lateness_us, self.core.tick_ns)
 
+    @property
+    def bears_name(self) -> bool:
+        """Whether its name still means this store: its creator has not closed it, and none has replaced it."""
+        return self.core.bears_name()
+
     def run_clock(self, wait_for: tuple[str, ...] = ()) -> RunningClock:
         """Tick a barrier or real-time store from a thread of C; a standby if another process ticks it already.
 
@@ -325,6 +330,12 @@ class Store:
     def wait_cycle(self, after: int, timeout_s: float) -> int | None:
         """Wait until the cycle is larger than `after`; None after the timeout: `clock` says whether it lives."""
         return self.core.wait_cycle(after, int(timeout_s * 1e9))
+
+    def edges(self) -> Edges:
+        """Give cycles as a file descriptor, for programs that wait in an event loop."""
+        if self.name is None:
+            raise NotOwner("a private store is ticked by whoever holds it: nobody else waits for its cycles")
+        return Edges(self.name, self.cycle)
 
     def wait_done(self, cycle: int, timeout_s: float) -> bool:
         """Wait until all living participants have finished a cycle; False after the timeout."""

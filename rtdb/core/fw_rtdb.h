@@ -179,6 +179,8 @@ int fw_create(fw_db **out, const char *name, const fw_opts *opts);
 int fw_attach(fw_db **out, const char *name);
 /* Gives everything back; the creator also removes the name. */
 void fw_close(fw_db *db);
+/* 1 while the store's name means this store: it was not removed by its creator, nor replaced; 0 for a private one. */
+int fw_bears_name(const fw_db *db);
 /* For a forked child: lets go of memory and file without a trace, and never touches the parent's locks. */
 void fw_forget(fw_db *db);
 int64_t fw_tick_ns(const fw_db *db);
@@ -294,6 +296,17 @@ int fw_clock_start(fw_clock_thread **out, const char *name, const char *const *w
 int fw_clock_stop(fw_clock_thread *clock);
 /* For a forked child, in which the thread does not run: see fw_forget. */
 void fw_clock_forget(fw_clock_thread *clock);
+/* Cycles as a file descriptor, for poll(2): it becomes readable as each cycle after `after` begins, and stays so until
+ * everything was read from it; how much that is says nothing. A thread of its own hears of the cycles, attached on its
+ * own, without signals. */
+typedef struct fw_edges fw_edges;
+int fw_edges_start(fw_edges **out, const char *name, uint64_t after);
+/* The descriptor, which does not block; it is open until the stop. */
+int fw_edges_fd(const fw_edges *edges);
+/* Ends the thread and closes the descriptor. */
+void fw_edges_stop(fw_edges *edges);
+/* For a forked child, in which the thread does not run: see fw_forget. */
+void fw_edges_forget(fw_edges *edges);
 /* Notes, for fw_alive_at and for waiters, who died since the last tick: for stores that nobody ticks at the moment.
  * -EBUSY when somebody does. */
 int fw_mark_dead(fw_db *db);

@@ -202,7 +202,7 @@ int fw_create(fw_db **out, const char *name, const fw_opts *o) {
 /* Opens the file, checks it and says "I live here", on the file that bears the name and no other. */
 static int enter(fw_db *db) {
     for (int i = 0; i < 10; i++) {
-        struct stat mine, there;
+        struct stat mine;
         fw_header h;
         db->can_wake = 1;
         db->fd = open(db->path, O_RDWR | O_CLOEXEC);
@@ -211,7 +211,7 @@ static int enter(fw_db *db) {
         if (pread(db->fd, &h, sizeof h, 0) != sizeof h || h.magic != FW_MAGIC || h.layout != FW_LAYOUT ||
             map_of(&h, &db->map) < 0 || fstat(db->fd, &mine) < 0 || (uint64_t)mine.st_size != h.size) return -EPROTO;
         if (!fw_lock_held(db, FW_LOCK_ALIVE)) return -EOWNERDEAD; /* left behind by a crash */
-        if (fw_lock(db, FW_LOCK_ALIVE, F_RDLCK) == 0 && stat(db->path, &there) == 0 && mine.st_ino == there.st_ino) return 0;
+        if (fw_lock(db, FW_LOCK_ALIVE, F_RDLCK) == 0 && fw_bears_name(db)) return 0;
         close(db->fd); /* it was replaced meanwhile */
         db->fd = -1;
     }
@@ -234,6 +234,11 @@ int fw_attach(fw_db **out, const char *name) {
     fw_mark_dead(db);
     *out = db;
     return 0;
+}
+
+int fw_bears_name(const fw_db *db) {
+    struct stat mine, there;
+    return db->fd >= 0 && fstat(db->fd, &mine) == 0 && stat(db->path, &there) == 0 && mine.st_ino == there.st_ino;
 }
 
 void fw_close(fw_db *db) {

@@ -195,8 +195,6 @@ def _run_clock(store: "Store", wait_for: tuple[str, ...]) -> None:
     """Tick until the store has ended, and say what this process is: waiting, ticking, a standby."""
     import os
 
-    from .segments import bears_name
-
     said, name = "", store.name or ""
     with store.run_clock(wait_for):
         looks_without = 0
@@ -213,7 +211,7 @@ def _run_clock(store: "Store", wait_for: tuple[str, ...]) -> None:
             if words.partition(" (")[0] != said.partition(" (")[0]:
                 typer.echo(words)
                 said = words
-            if mine and not bears_name(name, store.core.id) and not any(c.alive for c in store.components()):
+            if mine and not store.bears_name and not any(c.alive for c in store.components()):
                 typer.echo(f"store {name!r} has ended, after cycle {now.cycle}", err=True)
                 return
             waited_out = store.core.wait_directory(version, int(LOOK_S * 1e9)) is None

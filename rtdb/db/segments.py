@@ -17,7 +17,7 @@ from pathlib import Path
 FOLDER = Path("/dev/shm")
 LOCK_ALIVE = 0  # byte that everybody who lives in a store has locked; as in core/fw_layout.h
 _MAGIC = b"FAYRTDB1"
-_HEADER = struct.Struct("<8sIIIIQQ")  # magic, layout, three sizes, size, store id: the first of fw_header
+_HEADER = struct.Struct("<8sI")  # magic, layout: the first of fw_header
 _FLOCK = struct.Struct("hhqqi4x")  # type, whence, start, length, pid: as in fcntl(2)
 
 
@@ -92,29 +92,14 @@ def segments(pattern: str = "*") -> list[Segment]:
     return found
 
 
-def _header(path: Path) -> tuple[int, int] | None:
-    """Read layout and store id from a segment; None where it is no store."""
+def layout_of(path: Path) -> int | None:
+    """Read the number of the layout that a segment was made with; None where it is no store."""
     with path.open("rb") as file:
         data = file.read(_HEADER.size)
     if len(data) < _HEADER.size or not data.startswith(_MAGIC):
         return None
-    _, layout, *_, store_id = _HEADER.unpack(data)
-    return layout, store_id
-
-
-def layout_of(path: Path) -> int | None:
-    """Read the number of the layout that a segment was made with; None where it is no store."""
-    header = _header(path)
-    return header[0] if header else None
-
-
-def bears_name(store: str, store_id: int) -> bool:
-    """Tell whether the segment of that name is the store of that id: not that of a later one, and not removed."""
-    try:
-        header = _header(segment_path(store))
-    except FileNotFoundError:
-        return False
-    return header is not None and header[1] == store_id
+    _, layout = _HEADER.unpack(data)
+    return int(layout)
 
 
 def is_locked(path: Path) -> bool:

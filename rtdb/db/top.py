@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ..clock import ClockInfo, Kind
 from .console import table
 from .look import HEALTH, ComponentLook, Look, ObjectLook, look
-from .segments import bears_name, holders, segment_path
+from .segments import holders, segment_path
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -158,7 +158,7 @@ def end_of(store: "Store") -> tuple[str, int] | None:
     name = store.name or ""
     if store.clock.alive or any(info.alive for info in store.components()):
         return None
-    if not bears_name(name, store.core.id):
+    if not store.bears_name:
         return f"store {name!r} has ended, after cycle {store.cycle}", 0
     stat = segment_path(name).stat()
     if not all(process.only_looks for process in holders().get((stat.st_dev, stat.st_ino), ())):

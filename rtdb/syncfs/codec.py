@@ -255,6 +255,14 @@ def _encoder(number: int, layout: str) -> Encode:
             return whole.pack(whole.size, number, tag, *values)
 
         return encode_numbers
+    if not set(layout) - set("1248q"):
+        fixed = struct.Struct("<IBH" + "".join(_NUMBERS[c] for c in layout))
+        at = layout.index("q")
+
+        def encode_qid(tag: int, *values: Any) -> bytes:
+            return fixed.pack(fixed.size, number, tag, *values[:at], *values[at], *values[at + 1 :])
+
+        return encode_qid
     writers = [_WRITERS[kind] for kind in layout]
 
     def encode(tag: int, *values: Any) -> bytes:

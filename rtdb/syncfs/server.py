@@ -1,25 +1,22 @@
-"""The server: sessions on sockets, in one asyncio loop. A thread tells it the edges of the store.
+"""The server: sessions on sockets, in one asyncio loop, which hears of the store's edges through a file descriptor.
 
 A client that reads slowly is not listened to until it has taken what was sent; one that is dead costs its buffers.
 Neither delays an edge: replies go into the sockets' buffers, and the store's clock is not ours.
 """
 
 import asyncio
-import contextlib
 import errno
 import logging
 import os
 import socket
 import stat
 import struct
-import sys
-import threading
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, cast
 
-from ..errors import RtdbError
+from ..clock import Edges
 from ..store import Store
 from .addresses import Address
 from .errors import FsError
@@ -47,9 +44,7 @@ class FileServer:
         self.connections: set[Connection] = set()
         self._servers: list[asyncio.AbstractServer] = []
         self._sockets: list[Path] = []
-        self._stop = threading.Event()
-        self._watch: threading.Thread | None = None
-        self._told = False  # an edge is on its way to the loop
+        self._edges: Edges | None = None
         self._look: asyncio.TimerHandle | None = None
         self._looked_s = time.monotonic()
         self.over = asyncio.Event()  # the store has ended
@@ -60,8 +55,8 @@ class FileServer:
         """Listen; returns the addresses with their real ports. anywhere: others than this machine may come."""
         self._loop = asyncio.get_running_loop()
         bound = [await self._listen(address, anywhere) for address in addresses]
-        self._watch = threading.Thread(target=self._watch_edges, name="edges", daemon=True)
-        self._watch.start()
+        self._edges = self.store.edges()
+        self._loop.add_reader(self._edges.fileno(), self._edge)
         self._look_around()
         return bound
 
@@ -96,7 +91,8 @@ class FileServer:
 
     async def close(self) -> None:
         """End all connections, and leave the store."""
-        self._stop.set()
+        if self._edges is not None:
+            self._loop.remove_reader(self._edges.fileno())
         if self._look is not None:
             self._look.cancel()
         for server in self._servers:
@@ -105,36 +101,16 @@ class FileServer:
             connection.close()
         for path in self._sockets:
             path.unlink(missing_ok=True)
-        if self._watch is not None:
-            self._watch.join()
+        if self._edges is not None:
+            self._edges.close()
         self.service.close()
         self.store.close()
 
     # -- edges ----------------------------------------------------------------------------------------------------
 
-    def _watch_edges(self) -> None:
-        assert self.store.name is not None
-        with Store.attach(self.store.name) as store:
-            cycle = self.service.cycle
-            while not self._stop.is_set():
-                now = store.wait_cycle(cycle, 0.2)
-                if now is None:
-                    continue
-                cycle = now
-                if not self._told:
-                    self._told = True
-                    with contextlib.suppress(RuntimeError):  # the loop has ended
-                        self._loop.call_soon_threadsafe(self._edge)
-
     def _look_for_store(self) -> None:
         """End when the store has: its maker closed it, and another may have its name."""
-        assert self.store.name is not None
-        try:
-            with Store.attach(self.store.name) as found:
-                is_there = found.core.id == self.store.core.id
-        except RtdbError:
-            is_there = False
-        if not is_there and not self.over.is_set():
+        if not self.store.bears_name and not self.over.is_set():
             log.warning("store %r has ended, and so does its file server", self.store.name)
             self.over.set()
 
@@ -143,9 +119,9 @@ class FileServer:
         self._loop.call_soon(call)
 
     def _edge(self) -> None:
-        self._told = False
-        if not self._stop.is_set():
-            self.service.edge(time.monotonic())
+        assert self._edges is not None
+        self._edges.clear()
+        self.service.edge(time.monotonic())
 
     def _look_around(self) -> None:
         now_s = time.monotonic()
@@ -297,8 +273,6 @@ def run(
 ) -> None:
     """Serve until SIGINT or SIGTERM, or until a future is done. plain: without uvloop."""
     import signal
-
-    sys.setswitchinterval(0.0005)  # the thread that hears of edges waits for no slice of 5 ms
 
     async def serve() -> None:
         loop = asyncio.get_running_loop()

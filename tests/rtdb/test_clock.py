@@ -5,7 +5,9 @@ its time, and what it left out is counted.
 """
 
 import ast
+import asyncio
 import os
+import select
 import struct
 import subprocess
 import sys
@@ -451,6 +453,70 @@ def test_a_clock_ends_with_its_store(name, peer):
         assert not store.clock.alive
 
 
+# -- cycles as a file descriptor ------------------------------------------------------------------------------------
+
+
+def readable(edges, timeout_s=LONG_S):
+    return bool(select.select([edges], [], [], timeout_s)[0])
+
+
+def test_edges_are_readable_as_a_cycle_begins_and_no_more_when_they_were_cleared(shared, attached):
+    clock = attached()
+    with shared.edges() as edges:
+        for cycle in range(1, 20):
+            assert not readable(edges, 0)
+            shared.tick()
+            assert readable(edges)
+            edges.clear()
+            assert shared.cycle == cycle
+        theirs = clock("edges = store.edges()\nselect = __import__('select').select\nselect([edges], [], [], 0)[0]")
+        assert theirs == "[]"
+        shared.tick()
+        assert clock(f"[edges] == select([edges], [], [], {LONG_S})[0]") == "True"
+
+
+def test_edges_that_nobody_clears_stay_readable_and_hold_up_nobody(shared):
+    with shared.edges() as edges:
+        for _ in range(70_000):  # more than fit into a pipe
+            shared.tick()
+        assert readable(edges)
+        assert shared.cycle == 70_000
+
+
+def test_edges_of_a_running_clock_wake_an_event_loop(real):
+    real.run_clock()
+    seen = []
+
+    async def three():
+        loop, enough = asyncio.get_running_loop(), asyncio.Event()
+        with real.edges() as edges:
+
+            def edge():
+                edges.clear()
+                seen.append(real.cycle)
+                if len(seen) == 3:
+                    loop.remove_reader(edges)
+                    enough.set()
+
+            loop.add_reader(edges, edge)
+            await asyncio.wait_for(enough.wait(), LONG_S)
+
+    asyncio.run(three())
+    assert seen == sorted(set(seen))
+
+
+def test_edges_that_were_closed_have_no_descriptor(shared):
+    edges = shared.edges()
+    descriptor = edges.fileno()
+    edges.close()
+    edges.close()
+    assert edges.fileno() == -1
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(descriptor)
+    with Store.create() as private, pytest.raises(NotOwner, match="private"):
+        private.edges()
+
+
 def test_who_waits_for_a_write_in_a_barrier_store_without_a_clock_is_told(barrier, attached):
     writer = barrier.join("a").insert("n", Count)
     with pytest.raises(ClockDead, match="a/n"):
@@ -505,11 +571,11 @@ def ask(arguments):
 def test_realtime_says_of_each_thing_whether_it_got_it_or_why_not():
     cpu = min(os.sched_getaffinity(0))
     got, refused, whole, collects, frozen, fifo, cpus = ask(f"1, {{{cpu}}}")
-    asked = ("SCHED_FIFO 1", "locked memory", f"CPUs {cpu}", "frozen garbage")
+    asked = ("SCHED_FIFO 1", "locked memory", "awake CPUs", f"CPUs {cpu}", "frozen garbage")
     for thing in asked:
         lines = [line for line in (*got, *refused) if line.startswith(thing)]
         assert len(lines) == 1, thing
-    assert len(got) + len(refused) == 4
+    assert len(got) + len(refused) == len(asked)
     assert all("\n" not in line and ": " in line for line in refused)
     assert (whole, collects, frozen) == (not refused, False, True)
     assert ("SCHED_FIFO 1" in got, cpus) == (fifo, [cpu])

@@ -14,7 +14,7 @@ from looks import CLOCK, FIX, INFO, NOW
 from rtdb import Flag, Kind, Store
 from rtdb.db.doctor import examine, of_folder, of_segments, of_store, owes, span, state_of
 from rtdb.db.look import ComponentLook
-from rtdb.db.segments import bears_name, layout_of, remove, segments
+from rtdb.db.segments import layout_of, remove, segments
 
 ROOT = Path(__file__).parents[2]
 
@@ -132,18 +132,15 @@ def left(unique, peer) -> Iterator[str]:
 
 def test_a_living_store_is_found_with_who_is_attached(unique, peer):
     name, reader = unique(), peer()
-    with Store.create(name) as store:
+    with Store.create(name):
         reader(f"store = Store.attach({name!r})")
         [segment] = segments(name)
         assert (state_of(segment), segment.size) == ("living", 4 << 20)
         [process] = segment.holders  # this process is not among them
         assert process.pid == reader.process.pid
         assert "peer.py" in process.command
-        assert bears_name(name, store.core.id)
-        assert not bears_name(name, store.core.id + 1)
         assert not remove(segment)
         assert list(of_segments([segment])) == []
-    assert not bears_name(name, 1)
 
 
 def test_what_a_crash_left_is_stale_and_can_be_removed(left):
@@ -162,7 +159,7 @@ def test_a_store_that_came_to_life_since_it_was_looked_at_is_not_removed(left):
     [segment] = segments(left)
     with Store.create(left) as store:
         assert not remove(segment)
-        assert bears_name(left, store.core.id)
+        assert store.bears_name
 
 
 @pytest.mark.parametrize("data", [b"", b"junk", b"\xff" * 10_000], ids=["empty", "short", "ones"])

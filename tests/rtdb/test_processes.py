@@ -498,6 +498,20 @@ def test_two_components_of_one_process_are_two(store):
     assert [(c.name, c.alive) for c in store.components()] == [("one", False), ("two", True)]
 
 
+def test_a_store_bears_its_name_until_its_creator_closes_it(unique):
+    name = unique()
+    with Store.create(name) as made, Store.attach(name) as seen:
+        assert made.bears_name
+        assert seen.bears_name
+        made.close()
+        assert not seen.bears_name
+        with Store.create(name) as successor:
+            assert successor.bears_name
+            assert not seen.bears_name
+    with Store.create() as private:
+        assert not private.bears_name
+
+
 # -- forks --------------------------------------------------------------------------------------------------------
 
 FORK = """

@@ -1,15 +1,17 @@
 /* threads.c - what the thread sanitizer can look at: threads that share memory at the same address.
  *
  *   threads protocol COUNT   a writer, a clock and two readers run the protocol on two rings for COUNT writes
- *   threads clock NAME       a clock thread ticks a real-time store while its process reads and writes
+ *   threads clock NAME       clock threads tick a real-time store while its process reads, writes and polls its edges
  *
  * Exit status 0: no value was torn, no cut showed an effect without its cause. 1: one was. Others: it could not be tried.
  */
 #define _GNU_SOURCE
+#include <poll.h>
 #include <pthread.h>
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <unistd.h>
 
 #include "fw_layout.h"
 
@@ -89,11 +91,14 @@ static int protocol(void) {
 static int run_clock(const char *name) {
     fw_db *db;
     fw_clock_thread *first, *standby;
+    fw_edges *edges;
+    uint8_t heard[64];
     fw_opts opts = {.clock = FW_REAL, .tick_ns = 1000000};
     const char *const wait_for[] = {"worker"};
     int r = fw_create(&db, name, &opts);
     if (r == 0) r = fw_clock_start(&first, name, wait_for, 1);
     if (r == 0) r = fw_clock_start(&standby, name, wait_for, 1);
+    if (r == 0) r = fw_edges_start(&edges, name, 0);
     if (r < 0) { fprintf(stderr, "start: %d\n", r); return 2; }
     int component = fw_join(db, "worker", NULL);
     fw_spec spec = {.name = "worker/count", .size = 512, .n_slots = 16, .every = 1, .component = (uint32_t)component};
@@ -107,8 +112,11 @@ static int run_clock(const char *name) {
         if (c < 0 || w < 0 || fw_read(db, h, (uint64_t)w, back, sizeof back, &info) < 0) r = 1;
         if (back[0] != k || back[WORDS - 1] != k) r = 1;
         fw_done(db, (uint32_t)component, (uint64_t)c);
+        struct pollfd cycles = {.fd = fw_edges_fd(edges), .events = POLLIN};
+        if (poll(&cycles, 1, 1000) != 1 || read(cycles.fd, heard, sizeof heard) < 1) r = 1;
         if (k == 25 && fw_clock_stop(first) < 0) r = 1; /* the standby goes on */
     }
+    fw_edges_stop(edges);
     if (fw_clock_stop(standby) < 0) r = 1;
     printf("cycles %lu torn %d\n", (unsigned long)fw_cycle(db), r);
     fw_close(db);
