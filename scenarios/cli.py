@@ -1,5 +1,6 @@
 """The `fairway` command. Every import that costs time stands inside a command's body."""
 
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -261,7 +262,13 @@ def play(
 
 
 def main() -> None:
-    """Run the command; what a user can mend is one line on standard error."""
+    """Run the command; what a user can mend is one line on standard error.
+
+    SIGTERM and the end of a terminal (SIGHUP) are what Ctrl-C is, so that neither a store nor a process stays behind.
+    """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+            signal.signal(number, signal.default_int_handler)
     try:
         _run()
     except KeyboardInterrupt:

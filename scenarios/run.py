@@ -313,7 +313,7 @@ def ending(code: int) -> str:
 
 @contextmanager
 def ctrl_c_between_cycles() -> Iterator[Callable[[], bool]]:
-    """Keep the first Ctrl-C until it is asked for; a second one does not wait."""
+    """Keep the first Ctrl-C or SIGTERM until it is asked for; a second one does not wait."""
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False  # signals go to the main thread
         return
@@ -324,11 +324,12 @@ def ctrl_c_between_cycles() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         pressed.append(number)
 
-    before = signal.signal(signal.SIGINT, note)
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(pressed)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def metadata(setup: Setup) -> dict[str, str]:

@@ -36,6 +36,7 @@ READABLE = [*PAGES, ROOT / "README.md"]
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 GENERATED = re.compile(r"(<!-- generated: ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 TIMEOUT_S = 120
+REAL_TIME = ("running.md",)  # nearly all of it runs in real time
 
 
 # -- running -------------------------------------------------------------------------------------------------------
@@ -141,7 +142,11 @@ class Session:
         return wrong
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=pytest.mark.proof) if page.name in REAL_TIME else page for page in PAGES],
+    ids=lambda page: page.name,
+)
 def test_everything_in_the_document_works(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:

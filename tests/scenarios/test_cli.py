@@ -362,9 +362,12 @@ class Running:
                 assert new is not None, f"the clock stands at {now}"
                 now = new
 
-    def interrupt(self) -> tuple[int, str, str]:
-        """Press Ctrl-C: the signal goes to the whole group. Returns exit code and what was said."""
-        os.killpg(self.process.pid, signal.SIGINT)
+    def interrupt(self, number: int = signal.SIGINT) -> tuple[int, str, str]:
+        """Press Ctrl-C, whose signal goes to the whole group, or send another. Returns exit code and what was said."""
+        if number == signal.SIGINT:
+            os.killpg(self.process.pid, number)
+        else:
+            self.process.send_signal(number)
         out, err = self.process.communicate(timeout=60)
         return self.process.returncode, out, err
 
@@ -484,11 +487,13 @@ def test_ctrl_c_as_the_store_appears_is_one_line(running: Callable[..., Running]
     nothing_left(drive)
 
 
-@pytest.mark.parametrize("cycle", [1, 33, 150])
-def test_ctrl_c_in_mid_drive_is_one_line_and_keeps_the_recording(running: Callable[..., Running], cycle: int) -> None:
+@pytest.mark.parametrize(("cycle", "number"), [(1, signal.SIGINT), (33, signal.SIGTERM), (150, signal.SIGINT)])
+def test_ctrl_c_in_mid_drive_is_one_line_and_keeps_the_recording(
+    running: Callable[..., Running], cycle: int, number: int
+) -> None:
     drive = running("mid", "--pace", 4)
     drive.until_cycle(cycle)
-    code, out, err = drive.interrupt()
+    code, out, err = drive.interrupt(number)
     assert code == 130, err
     assert err == f"interrupted; the recording up to there is in {drive.folder / 'run.mcap'}\n"
     assert out == ""
@@ -499,6 +504,19 @@ def test_ctrl_c_in_mid_drive_is_one_line_and_keeps_the_recording(running: Callab
         assert recording.read("odometry/travel", Odometry)
     assert not (drive.folder / "result.json").exists(), "no verdict on half a drive"
     nothing_left(drive)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_drive_that_waits_for_a_script_leaves_nothing_when_it_is_ended(
+    running: Callable[..., Running], tmp_path: Path, number: int
+) -> None:
+    drive = running("waits", "--use", "follow=files", "--listen", f"unix:{tmp_path}/files")
+    drive.until((tmp_path / "files").exists)
+    code, _, err = drive.interrupt(number)
+    assert code == 130, err
+    assert err.endswith("interrupted\n")
+    nothing_left(drive)
+    assert not (tmp_path / "files").exists()
 
 
 def test_ctrl_c_ends_the_processes_of_a_shuffled_drive(running: Callable[..., Running]) -> None:
