@@ -618,6 +618,7 @@ def test_process_that_takes_too_much_memory_breaks_alone(bad: Path, straight: Sc
     assert "MemoryError: there is no memory left for it; memory_mb" in reason_of(recording)
 
 
+@pytest.mark.proof  # for some seconds
 def test_process_that_sleeps_is_ended_and_the_cart_stands(
     bad: Path, straight: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -43,6 +43,7 @@ def test_keys_are_named_and_unknown_ones_left_out():
     assert split_keys("\x1b[A\x1b[Dx q\x1b[C") == ["up", "left", "hold", "quit", "right"]
 
 
+@pytest.mark.proof  # at the pace of a hand
 def test_drive_by_hand_through_a_terminal_moves_the_cart_and_is_recorded(tmp_path):
     ours, theirs = pty.openpty()
     command = [sys.executable, "-m", "scenarios", "drive", "safety/host-dies", "--by-hand", "--out", str(tmp_path)]

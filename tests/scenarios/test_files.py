@@ -181,6 +181,7 @@ def test_a_script_that_asks_for_too_much_is_not_obeyed(short: Scenario, tmp_path
     assert any("/speed_mps" in reason and "99" in reason for reason in drove.reasons), drove.reasons
 
 
+@pytest.mark.proof  # for some seconds
 def test_a_script_that_sleeps_is_not_waited_for_for_ever(short: Scenario, tmp_path: Path) -> None:
     drove = seen(tmp_path, short, *straight("n < 80 or __import__('signal').pause()"))
     assert drove.stood_in_the_end
