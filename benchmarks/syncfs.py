@@ -3,9 +3,9 @@
     python benchmarks/syncfs.py [ops] [barrier] [100ms] [100ms-any] [10ms] [1ms] [--seconds 30] [--load] [--python]
 
 ops: reads of 100 bytes, against a bare asyncio server that answers as many bytes. The others: N components, each stats
-its clock, reads the status of four others and writes its own; 100ms, 10ms and 1ms with SCHED_FIFO, CPUs kept awake where
-the system grants it (`rtdb.realtime`), the others as any process. Components are syncfs_client.c, so that it is the
-server that is measured; --python, or without a C compiler: `component` below. --load: two busy loops beside it.
+its clock, reads the status of four others and writes its own; 100ms, 10ms and 1ms with SCHED_FIFO and CPUs kept awake,
+where the system grants it (`rtdb.realtime`), the others as any process. Components are syncfs_client.c, so that it is
+the server that is measured; --python, or without a C compiler: `component` below. --load: two busy loops beside it.
 The 10 minutes of issue 6: `100ms --seconds 600`.
 
 What no program can help is in two yardsticks of the same run: the time that a hypervisor gave to others ("stolen"), and

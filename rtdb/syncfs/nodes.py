@@ -17,7 +17,7 @@ from .content import Content
 from .errors import FsError
 from .pace import Pace
 from .policy import Who
-from .status import padded, picture, picture_size
+from .status import padded, picture, picture_size, source_of
 
 if TYPE_CHECKING:
     from .tree import Tree
@@ -63,6 +63,10 @@ class File(Node):
     def content(self, cycle: int, who: Who) -> bytes:
         """Give what a cut shows."""
         raise NotImplementedError
+
+    def sources(self, cycle: int) -> list[tuple[int, int]]:
+        """Give the writes (object id, number) behind what a cut shows."""
+        return []
 
     def check_write(self, who: Who) -> None:
         """Raise FsError for whoever may not write it."""
@@ -154,6 +158,9 @@ class StatusFile(File):
 
     def content(self, cycle: int, who: Who) -> bytes:
         return self.tree.status_of(self.component).text(cycle)
+
+    def sources(self, cycle: int) -> list[tuple[int, int]]:
+        return self.tree.status_of(self.component).sources(cycle)
 
     def check_write(self, who: Who) -> None:
         if not who.may_write(self.component):
@@ -251,6 +258,10 @@ class PictureFile(File):
 
     def content(self, cycle: int, who: Who) -> bytes:
         return picture(self.obj, self.field, cycle)
+
+    def sources(self, cycle: int) -> list[tuple[int, int]]:
+        source = source_of(self.obj, cycle)
+        return [] if source is None else [source]
 
 
 class ServerFile(File):

@@ -1,8 +1,9 @@
 """Seats: components without a module. Whoever attaches with its token is the component, in whatever language.
 
 A seat joins the store with the first attach and leaves with the last connection, or when a barrier has waited for it
-too long. What it writes is the JSON object `<component>/status`; JSON that is none stays out, the last good one stands,
-and the component's health says so. Its readers apply their rules of age and range.
+too long. What it writes is the JSON object `<component>/status`, which names what it had read as its causes; JSON that
+is none stays out, the last good one stands, and the component's health says so. Readers apply their own rules of age
+and range.
 """
 
 import logging
@@ -18,9 +19,11 @@ from ..objects import HOST_DEPENDENT, Flag, Writer
 from ..store import Store
 from .pace import Pace
 
+Causes = tuple[tuple[int, int], ...]
 log = logging.getLogger(__name__)
 HISTORY_S = 2.0
 CONFIG_BYTES = 2000
+CAUSES = 8  # that a status names, at most: what was read last
 SILENT_EDGES = 3  # without a status, before its health says so
 OWN = ("config", "status", "health")  # its objects
 
@@ -56,7 +59,9 @@ class Seat:
         self._waiting = 0  # stats of its clock that are held
         self._since_s = 0.0  # when it was woken, by the host's clock
         self._wrote, self.refused, self.missed = 0, 0, 0
-        self._held: bytes | None = None
+        self._held: tuple[bytes, Causes] | None = None
+        self._read: dict[int, int] = {}  # what it read last: the writes by object
+        self._told = False  # a status came from that
 
     def sit(self, user: object) -> None:
         """A connection attaches as this component. InUse if a process of its own is it."""
@@ -81,6 +86,7 @@ class Seat:
             self._status = component.insert(
                 "status",
                 json_schema(spec.status_bytes),
+                n_causes=CAUSES,
                 every=spec.every,
                 phase=(spec.phase + 1 + spec.latency_cycles) % spec.every,
                 history_s=HISTORY_S,
@@ -92,6 +98,7 @@ class Seat:
             if obj.name.partition("/")[2] not in OWN:
                 store.delete(obj)
         self._component, self._begun, self._came, self._waiting = component, None, False, 0
+        self._read.clear()
         self._since_s, self._wrote = time.monotonic(), store.cycle
         self._said = (State.UNKNOWN, "")
         self._say(State.RUNNING, "attached")
@@ -107,13 +114,22 @@ class Seat:
     def _leave(self, why: str) -> None:
         if self._component is not None:
             if self._held is not None:
-                self._write(self._held)
+                self._write(*self._held)
             was, text = self._said
             self._say(State.FAILURE, f"{why}; {text}" if was is State.WARNING else why)
             self._component.leave()
             self._component = self._status = self._held = None
 
     # -- what it does ---------------------------------------------------------------------------------------------
+
+    def has_read(self, sources: list[tuple[int, int]]) -> None:
+        """Note what it read: its status comes from what it read before it, since the status before that."""
+        if self._told:
+            self._read.clear()
+            self._told = False
+        for oid, write in sources:
+            self._read.pop(oid, None)  # the last of them stand last
+            self._read[oid] = write
 
     def commit(self, data: bytes) -> None:
         """Take what it wrote as its status; RecordError if that is no JSON object."""
@@ -125,18 +141,18 @@ class Seat:
             self.refused += 1
             self._say(State.WARNING, f"status refused ({self.refused} so far): {error}")
             raise
-        self._write(payload)
-        self._wrote = self._store.cycle
+        self._write(payload, tuple(self._read.items())[-CAUSES:])
+        self._told, self._wrote = True, self._store.cycle
         self._say(State.RUNNING, "")
 
-    def _write(self, payload: bytes) -> None:
+    def _write(self, payload: bytes, causes: Causes) -> None:
         assert self._status is not None
         core, handle = self._store.core, self._status.handle
         try:
-            core.write(handle, payload, core.not_before(handle, core.now_ns), ())
+            core.write(handle, payload, core.not_before(handle, core.now_ns), causes)
             self._held = None
         except TooFast:  # more in this cycle than the ring holds: the newest follows at the edge
-            self._held = payload
+            self._held = payload, causes
 
     def stat(self) -> None:
         """It waits in a stat of its clock: it has done what it was woken for."""
@@ -164,7 +180,7 @@ class Seat:
         if self._component is None:
             return
         if self._held is not None:
-            self._write(self._held)
+            self._write(*self._held)
         if cycle - self._wrote > SILENT_EDGES * self.spec.every and self._said[0] is not State.WARNING:
             self._say(State.WARNING, f"silent since cycle {self._wrote}")
 

@@ -313,6 +313,8 @@ class Session:
         if offset == 0 or data is None:
             assert isinstance(node, File)
             data = fid.pinned = self._tree.read(node, self._shown(fid), fid.who)
+            if fid.who.component is not None:
+                self._tree.note_read(fid.who.component, node, self._shown(fid))
         return self._reply("Rread", tag, data[offset : offset + count])
 
     def _write(self, tag: int, number: int, offset: int, data: bytes) -> bytes:

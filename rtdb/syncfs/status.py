@@ -78,6 +78,10 @@ class StatusView:
             self._write, self._written = write, (b"", 0) if raw is None else (raw[0].partition(b"\0")[0], raw[2])
         return self._written
 
+    def sources(self, cycle: int) -> list[tuple[int, int]]:
+        """Give the writes (object id, number) that a cut shows here: causes of what a reader makes of them."""
+        return [source for obj in self._objects if (source := source_of(obj, cycle)) is not None]
+
     @staticmethod
     def _value(obj: Object[Any], cycle: int) -> Any:
         try:
@@ -88,6 +92,17 @@ class StatusView:
         except UNREADABLE:
             return None
         return None if sample is None else sample.value
+
+
+def source_of(obj: Object[Any], cycle: int) -> tuple[int, int] | None:
+    """Give the write of an object that a cut shows; None where there is none, and for what is written only once."""
+    if obj.static:
+        return None
+    try:
+        write = obj._store.core.visible_write(obj.handle, cycle)
+    except UNREADABLE:
+        return None
+    return (obj.oid, write) if write else None
 
 
 def padded(document: dict[str, Any], size: int) -> bytes:

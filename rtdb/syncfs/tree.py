@@ -119,6 +119,12 @@ class Tree:
             raise FsError(errno.EACCES, f"{component} is a program of its own: nobody else writes its status")
         return seat
 
+    def note_read(self, component: str, file: File, cycle: int) -> None:
+        """Note what a component has read: its next status comes from that."""
+        seat = self.seats.get(component)
+        if seat is not None:
+            seat.has_read(file.sources(cycle))
+
     def time_at(self, cycle: int, pace: Pace) -> dict[str, Any]:
         """Tell the time at an edge."""
         store, clock = self.store, self.store.clock

@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 import pytest
 
-from rtdb import Record, Store
+from rtdb import STATIC, Record, Store
 from rtdb.json_object import json_schema
 from rtdb.objects import Flag
 from rtdb.recorder import Recorder
@@ -494,6 +494,53 @@ def test_a_script_that_died_shows_in_its_components_health(seated):
     assert reader.json("follow/health")["state"] == "FAILURE"
     assert [c.alive for c in seated.store.components() if c.name == "follow"] == [False]
     assert reader.json("follow/status") == {}
+
+
+def test_a_status_names_what_its_script_had_read_as_its_causes(seated):
+    store = seated.store
+    eyes = store.join("eyes")
+    far, still = eyes.insert("far", json_schema(100)), eyes.insert("still", json_schema(100), flags=STATIC)
+    far.write({"gap_m": 9.0})
+    still.write({"size_m": 1.0})
+    seated.edge()
+    script, other, reader = (seated.client(token=f"token-of-{name}") for name in ("follow", "look", "operator"))
+    status = store.find("follow/status")
+
+    def causes():
+        seated.edge()
+        return status.visible(store.cycle).causes
+
+    script.write("follow/status", b"{}")
+    assert causes() == ()
+    script.read("eyes/status")
+    other.read("look/status")
+    script.write("follow/status", b"{}")
+    assert causes() == ((far.oid, 1),), "what is written once is nobody's cause, nor is what others read"
+    script.write("follow/status", b"{}")
+    assert causes() == ((far.oid, 1),), "it knows still what it had read"
+    far.write({"gap_m": 8.0})
+    seated.edge()
+    other.write("look/status", b"{}")
+    far.write({"gap_m": 7.0})
+    seated.edge()
+    script.read("look/status")
+    script.read("eyes/status")
+    reader.read("eyes/status")
+    script.write("follow/status", b"{}")
+    assert causes() == ((store.find("look/status").oid, 1), (far.oid, 3))
+
+
+def test_a_status_names_the_8_writes_that_were_read_last(seated):
+    eyes = seated.store.join("eyes")
+    seen = [eyes.insert(f"see{k}", json_schema(100)) for k in range(10)]
+    for one in seen:
+        one.write({})
+    seated.edge()
+    script = seated.client(token="token-of-follow")
+    script.read("eyes/status")
+    script.write("follow/status", b"{}")
+    seated.edge()
+    assert seated.store.find("follow/status").visible(seated.store.cycle).causes == tuple((o.oid, 1) for o in seen[2:])
 
 
 def test_what_a_script_writes_is_read_by_others_as_it_was_written(seated):
