@@ -38,7 +38,7 @@ from .tree import Tree
 from .waiting import Waiter, Waiting
 
 log = logging.getLogger(__name__)
-BASIC, ALL = 0x7FF, 0x3FFF  # masks of getattr: a look while walking, and a stat
+ALL = 0x3FFF  # mask of getattr in a stat(2); a look while walking asks for less
 O_ACCESS, O_EXCL, O_TRUNC, O_APPEND, O_DIRECTORY = 0o3, 0o200, 0o1000, 0o2000, 0o200000
 OREAD, OWRITE, ORDWR, OEXEC, OTRUNC, OAPPEND = 0, 1, 2, 3, 0x10, 0x80
 DMAPPEND = 0x40000000
