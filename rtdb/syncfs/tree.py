@@ -73,7 +73,7 @@ class Tree:
         except InUse as error:
             pid = next(info.pid for info in store.components() if info.name == FILES)
             raise InUse(
-                f"store {store.name!r} is served already, by process {pid}; for another address give that one a second --listen"
+                f"store {store.name!r} is served already, by process {pid}; give that one another --listen"
             ) from error
         self.seats = {spec.component: Seat(store, spec, patience_s) for spec in seats}
         self.report: Callable[[], dict[str, Any]] = dict
