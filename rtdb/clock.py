@@ -87,8 +87,10 @@ class Edges:
 
     def clear(self) -> None:
         """Make it unreadable until the next cycle. Look at the store's cycle behind this, not before."""
-        with contextlib.suppress(BlockingIOError):
-            os.read(self.fileno(), 4096)
+        descriptor = self.fileno()
+        if descriptor >= 0:  # a loop may still have its turn with one that was closed
+            with contextlib.suppress(BlockingIOError):
+                os.read(descriptor, 4096)
 
     def close(self) -> None:
         """End it."""

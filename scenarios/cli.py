@@ -1,6 +1,5 @@
 """The `fairway` command. Every import that costs time stands inside a command's body."""
 
-import signal
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -16,6 +15,7 @@ from rtdb.syncfs.cli import register as register_files
 from .cli_regression import register as register_regression
 from .cli_running import Listen, Token, Use, tokens_of
 from .cli_running import register as register_running
+from .ending import end_as_by_ctrl_c
 from .folder import Interrupted
 
 if TYPE_CHECKING:
@@ -262,13 +262,8 @@ def play(
 
 
 def main() -> None:
-    """Run the command; what a user can mend is one line on standard error.
-
-    SIGTERM and the end of a terminal (SIGHUP) are what Ctrl-C is, so that neither a store nor a process stays behind.
-    """
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
-            signal.signal(number, signal.default_int_handler)
+    """Run the command; what a user can mend is one line on standard error."""
+    end_as_by_ctrl_c()
     try:
         _run()
     except KeyboardInterrupt:

@@ -8,11 +8,9 @@ import gc
 import logging
 import os
 import random
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -32,6 +30,7 @@ from sim.world import World
 
 from .by_hand import HandHost, by_hand
 from .cart import TICK_NS, CartSetup, DriveError, SimulatedCart
+from .ending import asked_to_end, how_it_ended
 from .randomise import Kind
 from .scenario import Scenario
 from .version import version
@@ -45,6 +44,7 @@ log = logging.getLogger(__name__)
 STORE_BYTES = 8 << 20
 SETTLE_S = 1.0  # how long a finished cart stands before the drive ends
 PARTICIPANT_S = 60.0  # for a process to come
+ASK_S = 0.25  # between looks whether somebody asks for the end
 HANG_S = 75.0  # for the modules of a process to finish a cycle: longer than their own watch takes
 COLLECT_CYCLES = 3000
 Placement = Literal["inline", "process"]
@@ -95,6 +95,7 @@ class Drive:
         self._children: dict[str, subprocess.Popen[str]] = {}  # by component
         self._hand: HandHost | None = None
         self.lost = ""
+        self.asked: Callable[[], str] = str  # whether somebody asks for the end; nobody
         self._order = random.Random(setup.shuffle) if setup.shuffle is not None else None  # not part of the drive
         self._hosts: list[Host] = []
         self.simulated: SimulatedCart | None = None
@@ -221,17 +222,23 @@ class Drive:
         return self._over(cycle)
 
     def _wait_for_processes(self, cycle: int) -> None:
-        """Wait until all modules are done with a cycle; one that hangs is ended. The cart's limits stop the cart."""
-        while not self.cart.wait_done(cycle, HANG_S):
-            for info in self.cart.components():
-                process = self._children.get("files" if info.name in self._scripts else info.name)
+        """Wait until all modules are done with a cycle; one that hangs is ended. The cart's limits stop the cart.
+
+        How long a script is waited for is up to the file server.
+        """
+        until_s = time.monotonic() + HANG_S
+        while not self.cart.wait_done(cycle, ASK_S):
+            if self.asked():
+                raise KeyboardInterrupt
+            for info in self.cart.components() if time.monotonic() > until_s else ():
+                process = self._children.get(info.name)
                 if process is not None and info.participant and info.alive and info.done < cycle:
                     self.lost = self.lost or f"the process of {info.name} hung in cycle {cycle}, and was ended"
                     process.kill()
                     process.wait()
         for component, child in self._children.items():
             if not self.lost and child.poll() is not None:
-                self.lost = f"the process of {component} ended in cycle {cycle} ({ending(child.returncode)})"
+                self.lost = f"the process of {component} ended in cycle {cycle} ({how_it_ended(child.returncode)})"
 
     def _over(self, cycle: int) -> bool:
         """Say whether the drive ends: by time, by hand, or because the cart stands and will not go on."""
@@ -306,32 +313,6 @@ def is_end(shown: object) -> bool:
     return isinstance(shown, ModuleStatus) and shown.state is ModuleState.FAULT
 
 
-def ending(code: int) -> str:
-    """Say how a process ended."""
-    return f"exit status {code}" if code >= 0 else signal.Signals(-code).name
-
-
-@contextmanager
-def ctrl_c_between_cycles() -> Iterator[Callable[[], bool]]:
-    """Keep the first Ctrl-C or SIGTERM until it is asked for; a second one does not wait."""
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False  # signals go to the main thread
-        return
-    pressed: list[int] = []
-
-    def note(number: int, _frame: object) -> None:
-        if pressed:
-            raise KeyboardInterrupt
-        pressed.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(pressed)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def metadata(setup: Setup) -> dict[str, str]:
     """Say what a recording is of."""
     return {
@@ -366,7 +347,8 @@ def drive(
     begin: called once the cart stands assembled, with its stores; may give somebody who looks on. Ctrl-C raises
     KeyboardInterrupt between two cycles, so that the recording is whole up to there.
     """
-    with Drive(setup) as run, ctrl_c_between_cycles() as pressed, ExitStack() as stack:
+    with Drive(setup) as run, asked_to_end() as asked, ExitStack() as stack:
+        run.asked = asked
         recorder = stack.enter_context(Recorder(recording, [run.cart, run.world], metadata(setup)))
         observer = begin([run.cart, run.world]) if begin is not None else None
         begun_s = time.monotonic()
@@ -377,7 +359,7 @@ def drive(
         while not run.tick(recorder):
             if run.cart.cycle % COLLECT_CYCLES == 0:
                 gc.collect()
-            if pressed():
+            if asked():
                 raise KeyboardInterrupt
             if observer is not None:
                 observer.record()

@@ -13,16 +13,15 @@ sees for itself that they are gone. Nothing here commands the cart; the supervis
 
 import json
 import math
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
 
 from autonomy.module import ModuleError
@@ -38,9 +37,10 @@ from rtdb.syncfs.process import spawn as spawn_server
 from .cart import TICK_NS, DriveError
 from .cart_process import ORDERS
 from .course import CourseImpossible
+from .ending import asked_to_end, how_it_ended
 from .plan import course_record, rng_of
 from .rewire import stack_of
-from .run import SETTLE_S, STORE_BYTES, Setup, ending, is_end, metadata, seat_of
+from .run import SETTLE_S, STORE_BYTES, Setup, is_end, metadata, seat_of
 from .scenario import Scenario
 
 R = TypeVar("R", bound=Record)
@@ -209,8 +209,9 @@ class Supervisor:
 
     def _start_files(self) -> None:
         setup = self.setup
-        seats = [seat_of(wire) for wire in setup.scripts]
-        self._adopt(Child("files", "files", spawn_server(setup.db, seats, setup.listen, self._tokens.of, group=0)))
+        seats, priority = [seat_of(wire) for wire in setup.scripts], PRIORITY["files"] if setup.realtime else None
+        process = spawn_server(setup.db, seats, setup.listen, self._tokens.of, group=0, priority=priority)
+        self._adopt(Child("files", "files", process))
 
     def _start_recorder(self) -> None:
         setup, self._recordings = self.setup, self._recordings + 1
@@ -229,7 +230,7 @@ class Supervisor:
         while not is_there():
             for child in self._children.values():
                 if (code := child.process.poll()) is not None:
-                    raise DriveError(f"{child.name} ended at once ({ending(code)})", invalid=False)
+                    raise DriveError(f"{child.name} ended at once ({how_it_ended(code)})", invalid=False)
             if self._asked():
                 raise KeyboardInterrupt
             if time.monotonic() > deadline_s:
@@ -300,7 +301,7 @@ class Supervisor:
             names = [wire.component for wire in self.setup.scripts] if child.kind == "files" else [child.name]
             is_required = child.kind in ("module", "files") and not self._required.isdisjoint(names)
             do = what_to_do(child.kind, is_required, child.restarts_s, now_s)
-            what = f"{child.name} ended in cycle {self.cart.cycle} ({ending(code)})"
+            what = f"{child.name} ended in cycle {self.cart.cycle} ({how_it_ended(code)})"
             if child.kind == "hal":
                 what += ": " + (
                     self._told("hal") if code > 0 else "on a cart the safety node stops it, here it is gone"
@@ -439,24 +440,6 @@ class Supervisor:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close(wait=kind is None or issubclass(kind, Exception))
-
-
-@contextmanager
-def asked_to_end() -> Iterator[Callable[[], str]]:
-    """Keep the first Ctrl-C or SIGTERM until it is asked for; a second one does not wait for the cart to stand."""
-    came: list[int] = []
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        if came:
-            raise KeyboardInterrupt
-        came.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: f"{signal.Signals(came[0]).name} came" if came else ""
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def supervise(setup: RunSetup, say: Callable[[str], None]) -> Outcome:

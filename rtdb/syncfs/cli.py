@@ -1,5 +1,6 @@
 """Commands of the file system: `fairway serve`, `fairway fs`. Imports stay inside, so that `--help` is quick."""
 
+import contextlib
 import sys
 from typing import TYPE_CHECKING, Annotated
 
@@ -104,7 +105,8 @@ def serve(
 
 
 def _print(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    with contextlib.suppress(OSError):  # nobody reads it any more
+        print(line, file=sys.stderr, flush=True)
 
 
 def _made_if_absent(db: str, clock: str, tick_ms: float, size_mb: int, wait_for: list[str]) -> "Store | None":

@@ -67,12 +67,20 @@ class Content:
 
     def grow(self, n_bytes: int, slots: int = 0) -> None:
         """Begin an object with room for a revision. StoreFull where there is none."""
+        self.trim()
         room = room_for(n_bytes)
         slots = max(slots, slots_for(room))
         self.numbers.append(self._files.insert(room, slots))
         self.rooms.append(schema_for(room).size - _COUNT.size)  # a record ends at a multiple of 8
         self._slots = slots
         self._files.busy.add(self)
+
+    def trim(self) -> None:
+        """Give back the youngest object, if nothing was ever written to it: room for a revision that did not come."""
+        with contextlib.suppress(Deleted, ObjectMissing):
+            if len(self.numbers) > 1 and not self._files.store.core.object(self._files.handle(self.numbers[-1]))[11]:
+                self._files.delete(self.numbers.pop())
+                self.rooms.pop()
 
     def _written_anew(self, data: bytes) -> bool:
         """Write into a new object, with more slots: the ring is full for this cycle."""

@@ -1,9 +1,10 @@
 """Drafts: what is written through one open file, until it is a revision.
 
-A revision is whole: truncation, writes and close make one. A file that is kept open and written anew from offset 0
-gets a revision each time, without a tail of the one before. When such a one is finished can be seen in a JSON file:
-when it is JSON. Elsewhere it shows in the next beginning, in fsync or the close, or as the file is left alone for a
-whole cycle; while revisions are one write each, in the end of that write. Appended writes are revisions, each one.
+A revision is whole: truncation, writes and close make one. If a piece of a long write is refused, none of it shows. A
+file that is kept open and written anew from offset 0 gets a revision each time, without a tail of the one before. When
+such a one is finished can be seen in a JSON file: when it is JSON. Elsewhere it shows in the next beginning, in fsync
+or the close, or as the file is left alone for a whole cycle; while revisions are one write each, in the end of that
+write. Appended writes are revisions, each one.
 """
 
 import contextlib
@@ -25,8 +26,8 @@ class Draft:
     """
 
     __slots__ = (
-        "_base", "_commit", "_data", "_ended", "_is_whole", "_kept", "_most", "_piece", "_single", "_synced", "_tail",
-        "append", "dirty", "idle", "truncated",
+        "_base", "_commit", "_data", "_end", "_ended", "_is_whole", "_kept", "_most", "_piece", "_refused", "_single",
+        "_synced", "_tail", "append", "dirty", "idle", "truncated",
     )  # fmt: skip
 
     def __init__(
@@ -44,6 +45,8 @@ class Draft:
         self._most, self._piece = most_bytes, piece_bytes
         self._data: bytearray | None = bytearray() if created and not append else None
         self._tail = bytearray()  # what is appended to the newest revision, whatever that is by then
+        self._end: int | None = None  # of the write that is under way: its next piece begins there
+        self._refused: RtdbError | None = None  # a piece of this revision
         self._ended = 0  # writes of this revision that have come to their end
         self._single = self._kept = False  # the revision before, through this descriptor, was one write; there was one
         self._synced = False  # its user says by fsync what is whole
@@ -63,13 +66,17 @@ class Draft:
         del data[n_bytes:]
         data.extend(bytes(n_bytes - len(data)))
         self._data, self.truncated, self.dirty, self.idle, self._ended = data, True, True, False, 0
+        self._end = self._refused = None
 
     def write(self, offset: int, piece: bytes) -> None:
         """Take a piece. At offset 0 a new revision begins, unless one has just begun, or the file appends."""
+        if self._refused is not None and offset:
+            raise self._refused
         if not self.append:
             self._check(offset + len(piece))
         if not piece:
             return
+        self._refused = None
         if self.append and self._data is None:
             self._append(piece)
             return
@@ -84,6 +91,7 @@ class Draft:
             data.extend(bytes(offset - len(data)))
         data[offset : offset + len(piece)] = piece
         self._data, self.dirty, self.idle = data, True, False
+        self._end = offset + len(piece) if len(piece) == self._piece else None
         if len(piece) < self._piece:
             self._ended += 1
             self._show(data)
@@ -93,8 +101,20 @@ class Draft:
         self._check(size)
         self._tail += piece
         self.dirty, self.idle = True, False
+        self._end = size if len(piece) == self._piece else None
         if len(piece) < self._piece and size <= SHOWN_AT_ONCE_BYTES:
             self.finish()
+
+    def refused(self, offset: int, error: RtdbError) -> None:
+        """Note that a piece was refused. As part of a longer write it takes all of the revision along."""
+        if self._end is not None and (self.append or offset == self._end):
+            self._data, self._tail, self._end, self.dirty = None, bytearray(), None, False
+            self._refused = None if self.append else error
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether the next piece of a long write is to come."""
+        return self._end is not None
 
     def _check(self, n_bytes: int) -> None:
         if n_bytes > self._most:
@@ -116,7 +136,9 @@ class Draft:
 
     def _end_before(self) -> None:
         """A new revision begins: the one before is finished. What was wrong with it is not the new one's fault."""
-        self._single, self._kept, self.truncated = self._ended == 1, True, False
+        if self._ended or self._data:  # an empty revision says nothing about how its user writes
+            self._single = self._ended == 1
+        self._kept, self.truncated, self._end = True, False, None
         with contextlib.suppress(RtdbError):
             self.finish()
         self._data, self._ended = bytearray(), 0

@@ -5,6 +5,9 @@
 Each row is spelled once and kept until it changes.
 """
 
+import contextlib
+import logging
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -16,6 +19,7 @@ from .nodes import FREE, ROOT, FreeDir, FreeFile, Root
 if TYPE_CHECKING:
     from .tree import Tree
 
+log = logging.getLogger(__name__)
 KEPT = 16  # cycles whose names are kept at hand
 FILES = "files"  # component that owns the free files; it has no folder of its own
 
@@ -51,6 +55,16 @@ class Names:
                 self._rows[node.path] = msgspec.json.encode(row)
         self._write()
 
+    @contextlib.contextmanager
+    def kept(self, node: FreeFile) -> Iterator[None]:
+        """Note what happens to a file's row of objects."""
+        before = list(node.data.numbers)
+        try:
+            yield
+        finally:
+            if node.data.numbers != before:
+                self.changed(node)
+
     def removed(self, node: FreeFile | FreeDir) -> None:
         """Note that it is gone."""
         self._rows.pop(node.path, None)
@@ -78,12 +92,15 @@ class Names:
         try:
             self._text.take_newest()
             nodes = self._fill(self.root, self._text.newest)
-            for node in nodes:
-                if isinstance(node, FreeFile):
-                    node.data.take_newest()
         except (RtdbError, msgspec.DecodeError, LookupError, TypeError, ValueError):  # damaged: begin anew
             self.root.children.clear()
             nodes = []
+        for node in nodes:
+            if isinstance(node, FreeFile):
+                try:
+                    node.data.take_newest()
+                except RtdbError as error:  # damaged: the others are not
+                    log.warning("%s is lost: %s", node.name, error)
         named = {number for node in nodes if isinstance(node, FreeFile) for number in node.data.numbers}
         for number in set(self.contents.known()) - named:
             self.contents.delete(number)

@@ -202,13 +202,12 @@ class ConfigFile(File):
 
     def commit(self, data: bytes, who: Who) -> None:
         self.check_write(who)
-        core = self.tree.store.core
         try:
             payload = json_payload(data, self.obj.size)
         except RecordError as error:
             self.tree.refused(f"{self.component}/config", error)
             raise FsError(errno.EINVAL, str(error)) from error
-        core.write(self.obj.handle, payload, core.not_before(self.obj.handle, core.now_ns), ())
+        self.tree.write_config(self.obj.handle, payload)
 
     def is_whole(self, data: bytes | bytearray) -> bool | None:
         return is_json_object(data)
@@ -334,10 +333,8 @@ class FreeFile(File, Free):
     def commit(self, data: bytes, who: Who) -> None:
         if self.gone:
             raise FsError(errno.ENOENT, "it was removed")
-        before = len(self.data.numbers)
-        self.data.write(data)
-        if len(self.data.numbers) != before:
-            self.tree.names.changed(self)
+        with self.tree.names.kept(self):
+            self.data.write(data)
 
 
 class FreeDir(Directory, Free):

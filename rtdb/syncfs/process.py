@@ -14,6 +14,7 @@ from dataclasses import asdict
 from typing import Any
 
 from ..errors import RtdbError
+from ..realtime import realtime
 from .addresses import Address, default_address
 from .cli import invitation
 from .policy import Tokens
@@ -28,13 +29,17 @@ def spawn(
     tokens: Mapping[str, str],
     *,
     group: int | None = None,
+    priority: int | None = None,
 ) -> "subprocess.Popen[str]":
     """Start a file server for some components of a store. It ends with its standard input.
 
     listen: an address, None for the store's own socket; tokens: of those that shall not have one by chance;
-    group: process group, 0 for one of its own.
+    group: process group, 0 for one of its own; priority: of SCHED_FIFO, None for none.
     """
-    job = {"store": store_name, "listen": listen, "seats": [asdict(seat) for seat in seats], "tokens": dict(tokens)}
+    job = {
+        "store": store_name, "listen": listen, "seats": [asdict(seat) for seat in seats], "tokens": dict(tokens),
+        "priority": priority,
+    }  # fmt: skip
     child = subprocess.Popen(
         [sys.executable, "-m", "rtdb.syncfs.process"], stdin=subprocess.PIPE, text=True, process_group=group
     )
@@ -54,6 +59,9 @@ def main() -> int:
             tokens.give(seat.component, job["tokens"].get(seat.component))
         address = Address.parse(job["listen"]) if job["listen"] else default_address(job["store"])
         server = FileServer(job["store"], seats=seats, tokens=tokens)
+
+        if job["priority"] is not None and (refused := realtime(job["priority"]).refused):
+            print(f"files: no real time: {'; '.join(refused)}", file=sys.stderr)
 
         def ready(bound: list[Address]) -> None:
             names = ", ".join(seat.component for seat in seats)

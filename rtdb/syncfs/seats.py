@@ -97,7 +97,7 @@ class Seat:
         for obj in store.objects(f"{spec.component}/*"):  # what a module left that was it before
             if obj.name.partition("/")[2] not in OWN:
                 store.delete(obj)
-        self._component, self._begun, self._came, self._waiting = component, None, False, 0
+        self._component, self._begun, self._waiting = component, None, 0
         self._read.clear()
         self._since_s, self._wrote = time.monotonic(), store.cycle
         self._said = (State.UNKNOWN, "")
@@ -108,6 +108,7 @@ class Seat:
         if user in self._users:
             self._users.discard(user)
             if not self._users:
+                self._came = False
                 log.warning("%s left: its connection ended in cycle %d", self.spec.component, self._store.cycle)
                 self._leave(f"its connection ended in cycle {self._store.cycle}")
 

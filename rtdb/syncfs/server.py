@@ -25,7 +25,7 @@ from .session import Session
 
 log = logging.getLogger(__name__)
 LOOK_S = 0.25  # between looks at what stands still
-BATCH = 64  # messages of one client that are answered in a row
+BATCH, TURN_S = 64, 0.002  # so many messages of one client are answered in a row, for so long at most
 STORE_S = 2.0  # between looks whether the store is still there
 ATTACH_S = 10.0  # for a connection to say who it is
 _CREDENTIALS = struct.Struct("3i")
@@ -177,12 +177,12 @@ class Connection(asyncio.Protocol):
         if self._quick is not None:
             self._quick(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         if self.session is not None:
-            self._after(self.session.feed(data, BATCH))
+            self._after(self.session.feed(data, BATCH, TURN_S))
 
     def _go_on(self) -> None:
         self._turn = False
         if self.session is not None and not self.session.over:
-            self._after(self.session.go_on(BATCH))
+            self._after(self.session.go_on(BATCH, TURN_S))
 
     def _after(self, more: bool) -> None:
         """Let others have their turn before this client's next batch; it is not listened to meanwhile."""
@@ -271,14 +271,15 @@ def run(
     until: Callable[[], "asyncio.Future[Any]"] | None = None,
     plain: bool = False,
 ) -> None:
-    """Serve until SIGINT or SIGTERM, or until a future is done. plain: without uvloop."""
+    """Serve until SIGINT, SIGTERM or SIGHUP, or until a future is done. plain: without uvloop."""
     import signal
 
     async def serve() -> None:
         loop = asyncio.get_running_loop()
         over = server.over
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, over.set)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup does
+                loop.add_signal_handler(number, over.set)
         try:
             ready(await server.start(addresses, anywhere=anywhere))
             if until is not None:

@@ -7,11 +7,12 @@ or returns None for a stat of a clock, which is answered at the next edge. Repli
 import contextlib
 import errno
 import logging
+import math
 import os
 import struct
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import RtdbError
 from .codec import (
@@ -29,7 +30,7 @@ from .codec import (
 )
 from .draft import Draft
 from .errors import FsError, errno_of
-from .nodes import ClockFile, Directory, File, FreeDir, FreeFile, Node
+from .nodes import ClockFile, Directory, File, FreeDir, FreeFile, Node, StatusFile
 from .pace import Pace
 from .policy import Tokens, Who
 from .seats import Seat
@@ -40,12 +41,20 @@ from .waiting import Waiter, Waiting
 log = logging.getLogger(__name__)
 ALL = 0x3FFF  # mask of getattr in a stat(2); a look while walking asks for less
 O_ACCESS, O_EXCL, O_TRUNC, O_APPEND, O_DIRECTORY = 0o3, 0o200, 0o1000, 0o2000, 0o200000
-OREAD, OWRITE, ORDWR, OEXEC, OTRUNC, OAPPEND = 0, 1, 2, 3, 0x10, 0x80
+OREAD, OWRITE, ORDWR, OEXEC, OTRUNC, ORCLOSE, OAPPEND = 0, 1, 2, 3, 0x10, 0x40, 0x80
 DMAPPEND = 0x40000000
 SPECIAL = 0x02000000 | 0x01000000 | 0x00800000 | 0x00200000 | 0x00100000  # symlink, link, device, fifo, socket
 SET_MODE, SET_UID, SET_GID, SET_SIZE, SET_MTIME, SET_MTIME_TO = 0x1, 0x2, 0x4, 0x8, 0x20, 0x100
 SMALL_BYTES = 1 << 16  # drafts up to this size are not counted
 V9FS_MAGIC, BLOCK, AT_REMOVEDIR = 0x01021997, 4096, 0x200
+
+
+class How(NamedTuple):
+    """How a file is opened."""
+
+    access: int  # O_RDONLY, O_WRONLY or O_RDWR
+    append: bool
+    truncate: bool = False
 
 
 class Fid:
@@ -86,6 +95,7 @@ class Session:
         self._writing: dict[Fid, None] = {}  # open for writing, in the order of their opening
         self._dialect, self._msize = PLAIN, tree.limits.min_msize
         self._begun = False
+        self.attached = False  # it has said who it is
         self.over = False  # the connection is to be closed
         self.paused = False  # the client does not take its replies: nothing more is answered
         self.requests = 0
@@ -95,15 +105,19 @@ class Session:
 
     # -- bytes ----------------------------------------------------------------------------------------------------
 
-    def feed(self, data: bytes, at_most: int = 1 << 30) -> bool:
+    def feed(self, data: bytes, at_most: int = 1 << 30, for_s: float = math.inf) -> bool:
         """Take bytes as they came, and answer; see go_on."""
         self._buffer += data
-        return self.go_on(at_most)
+        return self.go_on(at_most, for_s)
 
-    def go_on(self, at_most: int = 1 << 30) -> bool:
-        """Answer so many messages, as long as replies are taken; says whether there may be more."""
-        buffer, at, last = self._buffer, 0, self.requests + at_most
-        while not self.paused and not self.over and self.requests < last and len(buffer) - at >= HEADER.size:
+    def go_on(self, at_most: int = 1 << 30, for_s: float = math.inf) -> bool:
+        """Answer so many messages, and so long, as long as replies are taken; says whether there may be more."""
+        buffer, at, last, until_s = self._buffer, 0, self.requests + at_most, time.monotonic() + for_s
+        more = False
+        while not self.paused and not self.over and len(buffer) - at >= HEADER.size:
+            more = self.requests >= last or time.monotonic() > until_s
+            if more:
+                break
             size = HEADER.unpack_from(buffer, at)[0]
             if size < HEADER.size or size > self._msize:
                 self._end(f"a message of {size} bytes, {HEADER.size} to {self._msize} are agreed upon")
@@ -114,7 +128,7 @@ class Session:
             at += size
         if at:
             del buffer[:at]
-        return self.requests == last
+        return more
 
     def _end(self, why: str) -> None:
         log.warning("a connection is closed: %s", why)
@@ -160,11 +174,6 @@ class Session:
     def _reply(self, name: str, tag: int, *values: Any) -> bytes:
         return self._dialect.encode[TYPES[name]](tag, *values)
 
-    @property
-    def attached(self) -> bool:
-        """Whether the client holds anything here."""
-        return bool(self._fids)
-
     def edge(self) -> None:
         """An edge of the tree's pace has come."""
         for fid in list(self._writing):
@@ -178,12 +187,16 @@ class Session:
         """The connection is over: fids and held stats go with it, and revisions that are not finished."""
         self.over = True
         self._reset()
+        self._handlers.clear()  # they hold this session, and nothing collects rings in real time
 
     def _reset(self) -> None:
         for tag in self._held:
             self._waiting.cancel((self, tag))
         self._held.clear()
         self._fids.clear()
+        for fid in self._writing:
+            if isinstance(fid.node, File):
+                self._tree.abandoned(fid.node)
         self._writing.clear()
         for seat in self._tree.seats.values():
             seat.rise(self)
@@ -228,7 +241,11 @@ class Session:
             raise FsError(errno.EBADF, f"no fid {number}")
         self._writing.pop(fid, None)
         if fid.draft is not None and not is_gone(fid.node):  # what was written goes with it
-            fid.draft.finish()
+            assert isinstance(fid.node, File)
+            try:
+                fid.draft.finish()
+            finally:
+                self._tree.abandoned(fid.node)
 
     # -- messages of all dialects ---------------------------------------------------------------------------------
 
@@ -257,6 +274,7 @@ class Session:
             except RtdbError:
                 del self._fids[fid]
                 raise
+        self.attached = True
         return self._reply("Rattach", tag, self._qid(tree.root, new))
 
     def _flush(self, tag: int, oldtag: int) -> bytes:
@@ -324,11 +342,16 @@ class Session:
         assert isinstance(fid.node, File)
         if is_gone(fid.node):
             raise FsError(errno.ENOENT, "it was removed")
-        end = len(data) if fid.draft.append else offset + len(data)
-        self._tree.room_for(fid.node, end)
-        if end > SMALL_BYTES:
-            self._check_drafts(end - fid.draft.n_bytes)
-        fid.draft.write(offset, data)
+        draft = fid.draft
+        end = draft.n_bytes + len(data) if draft.append else offset + len(data)
+        try:
+            self._tree.room_for(fid.node, end)
+            if end > SMALL_BYTES:
+                self._check_drafts(end - draft.n_bytes)
+            draft.write(offset, data)
+        except RtdbError as error:
+            draft.refused(offset, error)
+            raise
         return self._reply("Rwrite", tag, len(data))
 
     def _check_drafts(self, n_bytes: int) -> None:
@@ -371,9 +394,10 @@ class Session:
             node.check_write(fid.who)
             if len(self._writing) >= self._limits.writing:
                 raise FsError(errno.EMFILE, f"{self._limits.writing} files are open for writing")
+            who = fid.who
             fid.draft = Draft(
                 node.base,
-                lambda data: node.commit(data, fid.who),
+                lambda data: node.commit(data, who),  # not the fid, which holds the draft
                 append=append,
                 most_bytes=node.most_bytes,
                 piece_bytes=self._msize - IO_HEADER,
@@ -385,7 +409,7 @@ class Session:
                 fid.draft.truncate(0)
         fid.opened = access
 
-    def _create(self, fid: Fid, name: str, mode: int, gid: int, flags: tuple[int, bool], *, exclusive: bool) -> Node:
+    def _create(self, fid: Fid, name: str, mode: int, gid: int, how: How, *, exclusive: bool) -> Node:
         if not isinstance(fid.node, Directory):
             raise FsError(errno.ENOTDIR)
         if fid.opened is not None:
@@ -394,7 +418,8 @@ class Session:
         fresh = found or self._tree.create(fid.node, name, mode, fid.who, gid)
         directory, fid.node = fid.node, fresh
         try:
-            self._open_fid(fid, flags[0], append=flags[1], truncate=False, created=found is None)
+            truncate = found is not None and how.truncate
+            self._open_fid(fid, how.access, append=how.append, truncate=truncate, created=found is None)
         except RtdbError:
             fid.node = directory
             raise
@@ -410,12 +435,15 @@ class Session:
 
     def _lcreate(self, tag: int, number: int, name: str, flags: int, mode: int, gid: int) -> bytes:
         fid = self._fid(number)
-        how = flags & O_ACCESS, bool(flags & O_APPEND)
+        truncate = bool(flags & O_TRUNC) and flags & O_ACCESS != OREAD
+        how = How(flags & O_ACCESS, bool(flags & O_APPEND), truncate)
         node = self._create(fid, name, mode, gid, how, exclusive=bool(flags & O_EXCL))
         return self._reply("Rlcreate", tag, self._qid(node, fid), 0)
 
     def _open(self, tag: int, number: int, mode: int) -> bytes:
         fid = self._fid(number)
+        if mode & ORCLOSE:
+            raise FsError(errno.EOPNOTSUPP, "nothing is removed by a close")
         access = OREAD if mode & 3 == OEXEC else mode & 3
         truncate = bool(mode & OTRUNC) and not fid.node.is_dir
         self._open_fid(fid, access, append=bool(mode & OAPPEND), truncate=truncate)
@@ -425,6 +453,10 @@ class Session:
         fid = self._fid(number)
         if perm & SPECIAL:
             raise FsError(errno.EOPNOTSUPP, "there are files and directories")
+        if mode & ORCLOSE:
+            raise FsError(errno.EOPNOTSUPP, "nothing is removed by a close")
+        if fid.opened is not None:
+            raise FsError(errno.EBADF, "this fid is open")
         if perm & DMDIR:
             if not isinstance(fid.node, Directory):
                 raise FsError(errno.ENOTDIR)
@@ -434,7 +466,7 @@ class Session:
         else:
             access = OREAD if mode & 3 == OEXEC else mode & 3
             append = bool(mode & OAPPEND or perm & DMAPPEND)
-            node = self._create(fid, name, perm, 0, (access, append), exclusive=True)
+            node = self._create(fid, name, perm, 0, How(access, append), exclusive=True)
         return self._reply("Rcreate", tag, self._qid(node, fid), 0)
 
     # -- what a stat tells ----------------------------------------------------------------------------------------
@@ -463,10 +495,7 @@ class Session:
         seat: Seat | None = None
         if clock.component is not None and fid.who.may_write(clock.component):
             seat = self._tree.seat_of(clock.component)
-            for other in self._writing:  # what it keeps open is finished, too
-                if other.draft is not None and not other.draft.truncated:
-                    with contextlib.suppress(RtdbError):  # the component's health says so
-                        other.draft.finish()
+            self._finish_what_is_open()
         asked = pace.last(self._core.cycle)
         woken = self._woken.get(pace)
         if woken is not None and asked > woken:
@@ -485,6 +514,15 @@ class Session:
             seat.stat()  # behind `asked`: a barrier may tick at once
         self._held[tag] = None
         self._waiting.add((self, tag), pace, Waiter(asked, seat, time.monotonic(), answer))
+
+    def _finish_what_is_open(self) -> None:
+        """Make revisions of what a component keeps open, as it says that it is done; not of half a long write."""
+        for fid in self._writing:
+            draft = fid.draft
+            if draft is None or draft.truncated or (draft.is_under_way and not isinstance(fid.node, StatusFile)):
+                continue
+            with contextlib.suppress(RtdbError):  # the component's health says so
+                draft.finish()
 
     def _setattr(
         self, tag: int, number: int, valid: int, mode: int, uid: int, gid: int, size: int,

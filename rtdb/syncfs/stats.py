@@ -42,8 +42,12 @@ def entry_rows(listing: list[tuple[str, Node]], first: int, version: int, most_b
 
 
 def whole_stats(listing: bytes, offset: int, most_bytes: int) -> bytes:
-    """Give as many whole stats of a row of them as have room; EINVAL if not even one has."""
-    end = offset
+    """Give as many whole stats of a row of them as have room; EINVAL if not even one has, or none begins there."""
+    end = 0
+    while end < offset and end < len(listing):
+        end += 2 + _U16.unpack_from(listing, end)[0]
+    if end != offset:
+        raise FsError(errno.EINVAL, "a directory is read from its beginning, or where the last read ended")
     while end < len(listing):
         size = 2 + _U16.unpack_from(listing, end)[0]
         if end + size - offset > most_bytes:

@@ -21,7 +21,7 @@ from typing import Any
 
 from ..clock import Kind
 from ..components import ComponentInfo
-from ..errors import AgedOut, InUse, RtdbError
+from ..errors import AgedOut, InUse, RtdbError, TooFast
 from ..json_object import is_json
 from ..objects import Object
 from ..store import Store
@@ -84,6 +84,7 @@ class Tree:
         self._views: dict[str, StatusView] = {}
         self._objects: dict[str, list[Object[Any]]] = {}
         self._walls: dict[int, int] = {}
+        self._configs: dict[int, bytes] = {}  # by object, what is written at the next edge
         self.names = Names(self)
         self.root = self.names.root
         self.root.parent = self.root
@@ -105,6 +106,11 @@ class Tree:
         """Do what a new cycle of the store asks for."""
         for seat in self.seats.values():
             seat.edge(cycle)
+        for handle, payload in list(self._configs.items()):
+            try:
+                self.write_config(handle, payload)
+            except RtdbError as error:  # its component is gone
+                self.refused("a config", error)
         self.names.edge(cycle)
 
     def pace_of(self, component: str | None) -> Pace:
@@ -223,6 +229,15 @@ class Tree:
         if view is None:
             view = self._views[component] = StatusView(self.store, self._objects.get(component, []))
         return view
+
+    def write_config(self, handle: int, payload: bytes) -> None:
+        """Write a component's wiring; the newest of too many in one cycle follows at the edge."""
+        core = self.store.core
+        self._configs.pop(handle, None)
+        try:
+            core.write(handle, payload, core.not_before(handle, core.now_ns), ())
+        except TooFast:
+            self._configs[handle] = payload
 
     def refused(self, what: str, error: RtdbError) -> None:
         """Say what was not taken."""
@@ -373,7 +388,14 @@ class Tree:
         if isinstance(file, FreeFile) and not file.gone:
             rooms = file.data.rooms
             if (not rooms or n_bytes > rooms[-1]) and not self.names.contents.fits(n_bytes):
-                file.data.grow(n_bytes)  # deleted files may make room, which only an insert finds out
+                with self.names.kept(file):
+                    file.data.grow(n_bytes)  # deleted files may make room, which only an insert finds out
+
+    def abandoned(self, file: File) -> None:
+        """Take back what was kept for a revision: who wrote it has closed the file, or is gone."""
+        if isinstance(file, FreeFile) and not file.gone:
+            with self.names.kept(file):
+                file.data.trim()
 
     def read(self, file: File, cycle: int, who: Who) -> bytes:
         """Give a file's content in a cut; ESTALE where the store does not reach back so far."""

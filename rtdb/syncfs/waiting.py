@@ -1,10 +1,13 @@
 """Waiting: stats of clocks that are held until the next edge. Answered by an edge, a flush, or a clock that stands."""
 
+import logging
 from collections.abc import Callable, Hashable
 from typing import NamedTuple
 
 from .pace import Pace
 from .seats import Seat
+
+log = logging.getLogger(__name__)
 
 
 class Waiter(NamedTuple):
@@ -66,4 +69,7 @@ class Waiting:
             if waiter.seat is not None:
                 waiter.seat.wake(cycle)
         for _, waiter in due:
-            waiter.answer()
+            try:
+                waiter.answer()
+            except Exception:  # one client's trouble is not that of the others
+                log.exception("a stat that waited")

@@ -15,6 +15,7 @@ import pytest
 from hal.signals import Odometry
 from rtdb import Store, StoreMissing
 from rtdb.recording import Recording
+from rtdb.syncfs import Client
 from scenarios import cli
 from scenarios.judge import Verdict
 
@@ -517,6 +518,22 @@ def test_a_drive_that_waits_for_a_script_leaves_nothing_when_it_is_ended(
     assert err.endswith("interrupted\n")
     nothing_left(drive)
     assert not (tmp_path / "files").exists()
+
+
+def test_a_drive_whose_script_looks_around_first_ends_when_it_is_asked_to(
+    running: Callable[..., Running], tmp_path: Path
+) -> None:
+    """The script has attached, so the first cycle is due, and the barrier waits for it."""
+    address = f"unix:{tmp_path}/files"
+    drive = running("looks", "--use", "follow=files", "--listen", address, "--token", "follow=me")
+    drive.until((tmp_path / "files").exists)
+    with Client.connect(address, "me") as script:
+        drive.until_cycle(2)
+        assert "status" in script.ls("/follow")
+        code, _, err = drive.interrupt(signal.SIGTERM)
+    assert code == 130, err
+    assert f"interrupted; the recording up to there is in {drive.folder / 'run.mcap'}\n" in err
+    nothing_left(drive)
 
 
 def test_ctrl_c_ends_the_processes_of_a_shuffled_drive(running: Callable[..., Running]) -> None:

@@ -167,13 +167,14 @@ def test_without_the_clock_hal_stops_the_cart_on_its_own_time(live):
 
 
 @pytest.mark.proof
-def test_who_ends_the_run_stops_the_cart_first(live):
-    """By SIGTERM; docs/running.md, which is executed, does it by Ctrl-C."""
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_who_ends_the_run_stops_the_cart_first(live, number):
+    """docs/running.md, which is executed, does it by Ctrl-C. SIGHUP: the terminal is gone, such as that of an ssh."""
     run = live(metres=100)
     run.until_it_drives()
-    os.kill(run.process.pid, signal.SIGTERM)
+    os.kill(run.process.pid, number)
     assert run.ended() == 130, run.printed
-    assert "SIGTERM came, the cart was stopped; the recording up to there is in " in run.printed
+    assert f"{number.name} came, the cart was stopped; the recording up to there is in " in run.printed
     assert "Traceback" not in run.printed
     ends_well(run)
 

@@ -3,10 +3,12 @@
 import asyncio
 import contextlib
 import errno
+import gc
 import socket
 import threading
 import time
 import tracemalloc
+import weakref
 
 import pytest
 
@@ -25,6 +27,38 @@ def refused(call, *values):
     with pytest.raises(Refused) as caught:
         call(*values)
     return caught.value.code
+
+
+def test_connections_and_revisions_leave_no_rings_for_the_garbage_collector(make_rig):
+    """In real time nothing collects them."""
+    rig, gone = make_rig(), []
+    gc.collect()
+    gc.disable()
+    try:
+        for k in range(3):
+            fs = rig.client()
+            fid = fs.create(f"f{k}")
+            fs.pwrite(fid, b"x" * 10_000)
+            gone += [weakref.ref(fs.session), weakref.ref(fs.session._fids[fid].draft._commit)]
+            fs.clunk(fid)
+            fs.hang_up()
+            fs.session = None  # which holds this client
+        assert [ref() for ref in gone] == [None] * 6
+    finally:
+        gc.enable()
+
+
+def test_one_answer_that_fails_takes_no_other_along(make_rig):
+    rig = make_rig()
+    first, second = rig.client(), rig.client()
+    tags = [fs.stat("clock") for fs in (first, second)]
+
+    def broken(_):
+        raise OSError("nobody reads it")
+
+    first.session._send = broken
+    rig.edge()
+    assert second.reply(tags[1]) is not None
 
 
 # -- each limit ----------------------------------------------------------------------------------------------------
@@ -103,6 +137,21 @@ def test_too_large_a_status_is_efbig_where_only_the_seat_says_how_large(make_rig
         fs.fsync(fid)
 
     assert refused(say) == errno.EFBIG
+
+
+def test_unfinished_appends_count_as_unfinished_revisions(make_rig):
+    rig = make_rig(limits=Limits(draft_bytes=300_000))
+    fs = rig.client(msize=4096)
+    for k in range(5):
+        fs.clunk(fs.create(f"f{k}"))
+    fids = [fs.open(f"f{k}", O_WRONLY | O_APPEND) for k in range(5)]
+
+    def append_all():
+        for fid in fids:
+            for _ in range(30):
+                fs.call("Twrite", fid, 0, b"x" * (4096 - 24))  # a longer one is under way
+
+    assert refused(append_all) == errno.ENOSPC
 
 
 def test_too_many_files_are_enospc(make_rig):

@@ -8,6 +8,7 @@ import errno
 import json
 import math
 import threading
+import time
 from typing import Annotated
 
 import numpy as np
@@ -19,7 +20,7 @@ from rtdb.objects import Flag
 from rtdb.recorder import Recorder
 from rtdb.recording import Recording
 from rtdb.records import f8, image
-from rtdb.syncfs import OPERATOR, FsError, SeatSpec, Tokens
+from rtdb.syncfs import OPERATOR, FsError, Limits, SeatSpec, Tokens
 
 from .conftest import (
     EVERY,
@@ -310,6 +311,63 @@ def test_a_wstat_that_changes_nothing_is_the_fsync_of_unix_dialect(rig):
     fs.call("Twstat", fid, keep_everything())
     rig.edge()
     assert fs.read("f") == b"new"
+
+
+def test_a_long_write_of_which_a_piece_is_refused_leaves_the_revision_before(make_rig):
+    rig = make_rig(limits=Limits(file_bytes=20_000))
+    fs = rig.client(msize=4096)
+    fs.write("f", b"before")
+    rig.edge()
+    for flags, content in (
+        (O_WRONLY, b"x" * 30_000),
+        (O_WRONLY | O_TRUNC, b"y" * 30_000),
+        (O_WRONLY | O_APPEND, b"z" * 30_000),
+    ):
+        fid = fs.open("f", flags)
+        assert refused(fs.pwrite, fid, content) == errno.EFBIG
+        if not flags & O_APPEND:
+            assert refused(fs.pwrite, fid, b"more", 10) == errno.EFBIG, "it goes on from what is not there"
+        fs.clunk(fid)
+        rig.edge(2)
+        assert fs.read("f") == b"before"
+    fid = fs.open("f", O_WRONLY)
+    assert refused(fs.pwrite, fid, b"x" * 30_000) == errno.EFBIG
+    fs.pwrite(fid, b"begun anew")
+    fs.clunk(fid)
+    rig.edge()
+    assert fs.read("f") == b"begun anew"
+
+
+def test_a_stat_of_the_own_clock_leaves_a_long_write_that_is_under_way_alone(seated):
+    script, piece = seated.client(token="token-of-follow", msize=4096), 4096 - 24
+    script.write("f", b"before")
+    seated.edge()
+    long, short = script.open("f", O_WRONLY), script.create("short")
+    script.pwrite(long, b"x" * piece)
+    script.pwrite(short, b"first")
+    script.pwrite(short, b"done")  # a descriptor that is kept open and written again
+    tag = script.stat("follow/clock")
+    seated.edge()
+    script.told(tag)
+    assert (script.read("f"), script.read("short")) == (b"before", b"done")
+    script.pwrite(long, b"yy", piece)
+    script.clunk(long)
+    seated.edge()
+    assert script.read("f") == b"x" * piece + b"yy"
+
+
+def test_an_empty_revision_does_not_hold_up_the_next(rig, fs):
+    fs.write("f", b"")
+    fid = fs.open("f", O_WRONLY)
+    fs.pwrite(fid, b"zero")
+    for content in (b"one", b"", b"two", b"three"):
+        if content:
+            fs.pwrite(fid, content)
+        else:
+            fs.truncate(fid, 0)
+            fs.fsync(fid)
+        rig.edge()
+        assert fs.read("f") == content
 
 
 def test_truncate_by_name_is_a_revision_of_its_own(rig, fs):
@@ -1009,6 +1067,14 @@ def test_a_config_is_written_by_its_component_and_the_operator_and_shows_at_the_
         assert refused(seated.client(token=token).open, "follow/config", O_WRONLY) == errno.EACCES
 
 
+def test_a_config_written_very_often_in_a_cycle_shows_its_last_value(seated):
+    script = seated.client(token="token-of-follow")
+    for k in range(40):
+        script.write("follow/config", b'{"inputs": {}, "n": %d}' % k, sync=True)
+    seated.edge(2)
+    assert script.json("follow/config")["n"] == 39
+
+
 def test_an_invalid_config_is_refused_and_the_last_good_one_stays(seated):
     seated.client(token="token-of-follow")
     operator = seated.client(token="token-of-operator")
@@ -1214,6 +1280,63 @@ def test_what_a_server_took_before_it_ended_is_not_lost_to_its_successor(rig, fs
     assert (fs.read("f"), fs.read("old")) == (b"content", b"newer")
 
 
+def test_a_file_that_grows_in_a_full_store_is_not_lost_to_the_successor(make_rig):
+    rig = make_rig(size=2 << 20)
+    fs = rig.client(msize=8192)
+    fs.write("kept", b"small")
+    fs.write("other", b"precious")
+    rig.edge()
+    k = 0
+    while rig.service.tree.names.contents.fits(8000):
+        fs.write(f"f{k}", b"x" * 5000)
+        k += 1
+    grown = b"y" * 3000
+    fs.rm("f0")  # its room comes back when its history is over, which only an insert finds out
+    for _ in range(40):
+        rig.edge()
+        try:
+            fs.write("kept", grown, sync=True)
+        except Refused:
+            continue
+        break
+    rig.edge(3)
+    assert fs.read("kept") == fs.read(f"at/{rig.store.cycle}/kept") == grown
+    rig.again()
+    fs = rig.client()
+    assert (fs.read("kept"), fs.read("other"), fs.read("f1")) == (grown, b"precious", b"x" * 5000)
+
+
+def test_room_for_a_revision_that_never_came_is_given_back(make_rig):
+    rig = make_rig(size=2 << 20)
+    fs = rig.client(msize=8192)
+    fs.write("kept", b"small")
+    rig.edge()
+    node, budget = rig.service.tree.root.child("kept", 0), rig.service.tree.names.contents._budget
+    while rig.service.tree.names.contents.fits(30_000):
+        fs.write(f"f{budget.used}", b"x" * 30_000)
+    before = budget.used
+    other = rig.client(msize=8192)
+    fid = other.open("kept", O_WRONLY)
+    with contextlib.suppress(Refused):
+        other.pwrite(fid, b"y" * 40_000)
+    other.hang_up()
+    rig.edge(2)
+    assert (len(node.data.numbers), budget.used) == (1, before)
+    assert fs.read("kept") == b"small"
+
+
+def test_one_damaged_file_takes_no_other_along_to_the_successor(rig, fs):
+    for name in ("whole", "damaged"):
+        fs.write(name, name.encode())
+    rig.edge()
+    node = rig.service.tree.root.child("damaged", 0)
+    node.data.numbers.append(999)  # an object that is not there
+    rig.service.tree.names.changed(node)
+    rig.edge()
+    rig.again()
+    assert rig.client().read("whole") == b"whole"
+
+
 def test_a_successor_does_not_bring_removed_files_back(rig, fs):
     fs.write("f", b"content")
     rig.edge()
@@ -1257,6 +1380,23 @@ def test_who_gives_up_waiting_is_not_waited_for_for_ever(seated, how):
 
 def alive(rig, component):
     return next(info.alive for info in rig.store.components() if info.name == component)
+
+
+def test_who_comes_back_by_a_write_is_not_waited_for_for_ever_either(unique):
+    with Store.create(unique(), clock="barrier") as store:
+        tokens = Tokens({"follow": "token"})
+        rig = Rig(store, seats=[SeatSpec(component="follow", every=1, latency_cycles=0)], tokens=tokens)
+        script = rig.client(token="token")
+        script.stat("follow/clock")
+        rig.service.tree.seats["follow"].wake(0)  # an edge; it does not come back
+        for _ in range(2):
+            rig.service.look(time.monotonic() + 100.0)
+            assert not alive(rig, "follow")
+            script.write("follow/status", b"{}")
+            assert alive(rig, "follow")
+        rig.service.look(time.monotonic() + 100.0)
+        assert not alive(rig, "follow")
+        rig.service.close()
 
 
 def test_what_was_held_back_is_not_said_by_a_successor(seated):
