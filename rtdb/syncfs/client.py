@@ -14,12 +14,13 @@ import errno
 import json
 import os
 import socket
+import struct
 from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from .addresses import MSIZE, Address
-from .codec import HEADER, IO_HEADER, LINUX, MAX_WALK, NO_UID, NOFID, NOTAG, TYPES
+from .codec import HEADER, IO_HEADER, LINUX, MAX_WALK, NO_UID, NOFID, NOTAG, TYPES, Malformed
 from .errors import FsError
 
 ROOT = 0  # fid of what was attached
@@ -46,7 +47,7 @@ class Client:
     """A connection to a file server. Use it in a `with`, or close it."""
 
     def __init__(self, sock: socket.socket, token: str = "", msize: int = MSIZE) -> None:
-        self._sock, self._buffer = sock, b""
+        self._sock, self._buffer, self._msize = sock, b"", msize
         self._free, self._last = list[int](), ROOT
         self._open: dict[tuple[str, int], int] = {}  # fids of files that stay open
         msize, version = self._call("Tversion", msize, LINUX.name, tag=NOTAG)
@@ -312,15 +313,22 @@ class Client:
     def _call(self, name: str, *values: Any, tag: int = 1) -> tuple[Any, ...]:
         number = TYPES[name]
         try:
-            self._sock.sendall(LINUX.encode[number](tag, *values))
-            reply = self._receive()
+            request = LINUX.encode[number](tag, *values)
+        except struct.error as error:
+            raise FsError(errno.ENAMETOOLONG, f"{name}: a text has at most 65,535 bytes") from error
+        try:
+            self._sock.sendall(request)
+            got, answered, answer = LINUX.decoded(self._receive())
+        except Malformed as error:
+            self._sock.close()
+            what = f"what answers is no 9P server ({error}); the connection is closed"
+            raise FsError(errno.EPROTO, f"{name}: {what}") from error
         except OSError as error:  # what is under way would answer the next call
             self._sock.close()
             if isinstance(error, FsError):
                 raise
             code = errno.ETIMEDOUT if isinstance(error, TimeoutError) else error.errno or errno.EIO
             raise FsError(code, f"{name}: {os.strerror(code)}; the connection is closed") from error
-        got, answered, answer = LINUX.decoded(reply)
         if got == _ERROR:
             raise FsError(answer[0])
         if (got, answered) != (number + 1, tag):
@@ -329,13 +337,18 @@ class Client:
 
     def _receive(self) -> bytes:
         buffer = self._buffer
-        while len(buffer) < HEADER.size or len(buffer) < (size := HEADER.unpack_from(buffer)[0]):
+        while True:
+            if len(buffer) >= HEADER.size:
+                size = HEADER.unpack_from(buffer)[0]
+                if not HEADER.size <= size <= self._msize:
+                    raise Malformed(f"a message of {size} bytes")
+                if len(buffer) >= size:
+                    self._buffer = buffer[size:]
+                    return buffer[:size]
             data = self._sock.recv(1 << 18)
             if not data:
                 raise FsError(errno.ECONNRESET, "the file server has closed the connection")
             buffer += data
-        self._buffer = buffer[size:]
-        return buffer[:size]
 
     def close(self) -> None:
         """End the connection: who was a component is none any more."""

@@ -6,6 +6,7 @@ is none stays out, the last good one stands, and the component's health says so.
 and range.
 """
 
+import errno
 import logging
 import time
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from ..errors import RecordError, TooFast
 from ..json_object import json_payload, json_schema
 from ..objects import HOST_DEPENDENT, Flag, Writer
 from ..store import Store
+from .errors import FsError
 from .pace import Pace
 
 Causes = tuple[tuple[int, int], ...]
@@ -24,6 +26,7 @@ log = logging.getLogger(__name__)
 HISTORY_S = 2.0
 CONFIG_BYTES = 2000
 CAUSES = 8  # that a status names, at most: what was read last
+SLOWEST_S = 0.5  # between its edges: it sees the cut of its last one, and histories are short
 SILENT_EDGES = 3  # without a status, before its health says so
 OWN = ("config", "status", "health")  # its objects
 
@@ -48,6 +51,13 @@ class Seat:
     """One such component."""
 
     def __init__(self, store: Store, spec: SeatSpec, patience_s: float) -> None:
+        period_s = spec.every * store.tick_ns * 1e-9
+        if period_s > SLOWEST_S:
+            raise FsError(
+                errno.EINVAL,
+                f"{spec.component}: an edge every {period_s:g} s is too seldom: what others show is not kept so long; "
+                f"at most every {int(SLOWEST_S * 1e9) // store.tick_ns} ticks, {SLOWEST_S:g} s",
+            )
         self._store, self.spec, self._patience_s = store, spec, patience_s
         self.pace = Pace(spec.every, spec.phase)
         self._component: Component | None = None

@@ -578,6 +578,8 @@ class Session:
         if offset == 0 or not isinstance(fid.listing, list):
             fid.listing = [(".", node), ("..", node.parent or node), *node.entries(cycle)]
         rows = entry_rows(fid.listing, offset, cycle, min(count, self._msize - IO_HEADER))
+        if not rows:
+            fid.listing = None  # it was read to its end
         return self._reply("Rreaddir", tag, rows)
 
     def _stats_of(self, fid: Fid, node: Directory, offset: int, count: int) -> bytes:

@@ -5,9 +5,11 @@ import json
 import os
 import re
 import signal
+import socket
 import stat
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -139,6 +141,13 @@ def test_an_address_that_cannot_be_is_one_line(fairway, unique, words, said):
     assert done.stderr.count("\n") == 1, done.stderr
 
 
+def test_a_component_whose_edges_are_too_seldom_is_refused(fairway, unique):
+    done = fairway("serve", "--db", unique(), "--component", "slow:51")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "slow: an edge every 0.51 s is too seldom" in done.stderr
+    assert "at most every 50 ticks" in done.stderr
+
+
 @pytest.mark.parametrize(
     "words",
     [("--component", "a:0"), ("--component", "a:4:4"), ("--component", ":1"), ("--token", "b=x"), ("--clock", "sun")],
@@ -252,3 +261,33 @@ def test_a_client_that_ran_into_its_time_limit_is_closed(serve, unique, tmp_path
     assert caught.value.errno == errno.ETIMEDOUT
     with pytest.raises(FsError):
         client.ls()
+
+
+@pytest.mark.parametrize("answer", [b"\3\0\0\0\0\0\0zzzz", b"\x08\0\0\0\1\0\0z", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
+def test_a_client_of_something_else_is_told_so(answer):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+
+        def once():
+            connection, _ = other.accept()
+            with connection:
+                connection.recv(100)
+                connection.sendall(answer)
+
+        thread = threading.Thread(target=once)
+        thread.start()
+        with pytest.raises(FsError, match="no 9P server") as caught:
+            Client.connect(f"tcp:127.0.0.1:{other.getsockname()[1]}")
+        thread.join()
+    assert caught.value.errno == errno.EPROTO
+
+
+def test_a_name_longer_than_a_message_can_say_is_refused_and_the_connection_goes_on(serve, unique, tmp_path):
+    address = f"unix:{tmp_path}/s"
+    serve("--db", unique(), "--listen", address)
+    with Client.connect(address) as client:
+        with pytest.raises(FsError) as caught:
+            client.read("/" + "x" * 70_000)
+        assert caught.value.errno == errno.ENAMETOOLONG
+        assert "clock" in client.ls()
