@@ -125,6 +125,7 @@ class Content:
         """Take another file's place: what that one held shows until an edge shows what is here."""
         if not self.numbers:
             self.write(b"")
+        before.trim()
         self.numbers[:0], self.rooms[:0] = before.numbers, before.rooms
         before.numbers, before.rooms, before.held = [], [], False
         self._files.busy.discard(before)
@@ -134,23 +135,29 @@ class Content:
         """Take up the newest revision that a server before us wrote, seen or not."""
         core = self._files.store.core
         for number in reversed(self.numbers):
-            handle = self._files.handle(number)
-            head = core.object(handle)[11]
-            if head:
-                data = core.read(handle, head)[0]
-                (count,) = _COUNT.unpack_from(data)
-                self.newest = data[_COUNT.size : _COUNT.size + count]
-                return
+            with contextlib.suppress(Deleted, ObjectMissing):
+                handle = self._files.handle(number)
+                head = core.object(handle)[11]
+                if head:
+                    data = core.read(handle, head)[0]
+                    (count,) = _COUNT.unpack_from(data)
+                    self.newest = data[_COUNT.size : _COUNT.size + count]
+                    return
 
     def edge(self, cycle: int) -> bool:
         """Write what is held, and drop objects that have been followed by a larger one; False when all is done."""
         if self.held:
             self.held = not self._written(self.newest)
-        core = self._files.store.core
-        while len(self.numbers) > 1 and core.visible_write(self._files.handle(self.numbers[1]), cycle):
-            self._files.delete(self.numbers.pop(0))
-            self.rooms.pop(0)
+        seen = next((k for k in range(len(self.numbers) - 1, 0, -1) if self._shows(self.numbers[k], cycle)), 0)
+        for number in self.numbers[:seen]:
+            self._files.delete(number)
+        del self.numbers[:seen], self.rooms[:seen]
         return self.held or len(self.numbers) > 1
+
+    def _shows(self, number: int, cycle: int) -> bool:
+        with contextlib.suppress(Deleted, ObjectMissing):
+            return bool(self._files.store.core.visible_write(self._files.handle(number), cycle))
+        return False
 
     def drop(self) -> None:
         """Delete the file's objects; what they held stays readable for a while, for `/at`."""

@@ -1334,7 +1334,11 @@ def test_one_damaged_file_takes_no_other_along_to_the_successor(rig, fs):
     rig.service.tree.names.changed(node)
     rig.edge()
     rig.again()
-    assert rig.client().read("whole") == b"whole"
+    fs = rig.client()
+    assert fs.read("whole") == b"whole"
+    fs.write("damaged", b"mended")
+    rig.edge(3)
+    assert fs.read("damaged") == b"mended"
 
 
 def test_a_successor_does_not_bring_removed_files_back(rig, fs):
