@@ -62,7 +62,7 @@ def run(
     """Run a scenario's stack in real time, each part in a process of its own, and judge it.
 
     Exit status: 0 pass, 1 a criterion broke or could not be measured, 2 bad input, 3 something was lost and the cart
-    stopped, 130 after Ctrl-C or SIGTERM, which stop the cart first.
+    stopped, 130 after Ctrl-C, SIGTERM or the end of the terminal, which stop the cart first.
     """
     from autonomy.wiring import stack_with
 
