@@ -10,8 +10,8 @@ ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def end_as_by_ctrl_c() -> None:
-    """Have each of them raise KeyboardInterrupt, so that neither a store nor a process stays behind."""
-    for number in ASKING:
+    """Have the others raise KeyboardInterrupt too, so that neither a store nor a process stays behind."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
         if not _is_nohup(number):
             signal.signal(number, signal.default_int_handler)
 
