@@ -98,7 +98,7 @@ class FileServer:
         for server in self._servers:
             server.close()
         for connection in list(self.connections):
-            connection.close()
+            connection.abort()
         for path in self._sockets:
             path.unlink(missing_ok=True)
         if self._edges is not None:
@@ -133,7 +133,7 @@ class FileServer:
             session = connection.session
             if session is not None and not session.attached and now_s - connection.made_s > ATTACH_S:
                 log.warning("a connection is closed: it did not attach for %g s", ATTACH_S)
-                connection.close()
+                connection.abort()
         self._look = self._loop.call_later(LOOK_S, self._look_around)
 
 
@@ -221,9 +221,14 @@ class Connection(asyncio.Protocol):
             self._server.service.end(self.session)
 
     def close(self) -> None:
-        """End it."""
+        """End it, once it has taken what was sent."""
         if self._transport is not None:
             self._transport.close()
+
+    def abort(self) -> None:
+        """End it now: who takes no replies would never let it end."""
+        if self._transport is not None:
+            self._transport.abort()
 
 
 def _is_friend(sock: socket.socket) -> bool:

@@ -302,12 +302,13 @@ def test_a_file_made_and_removed_10_000_times_costs_no_room(rig, fs):
 
 
 class Served:
-    """A file server in a thread, over a stepped store that the test ticks."""
+    """A file server in a thread, over a stepped store that the test ticks; it gives up on nobody who is slow."""
 
     def __init__(self, name, path, **options):
         self.store = Store.create(name, size=16 << 20)
         self.address, self._ready = Address(path=path), threading.Event()
-        self._options, self._name, self.failed = options, name, []
+        self._options = {"grace_s": 1e9, "patience_s": 1e9, **options}
+        self._name, self.failed = name, []
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         assert self._ready.wait(LONG_S)
@@ -390,6 +391,23 @@ def put(sock, name, *values, tag=1):
     return take(sock)
 
 
+def fill(served, sock, request):
+    """Ask, and take no reply, until the server does not listen any more; gives the bytes sent."""
+    sock.setblocking(False)
+    sent = 0
+
+    def is_full():
+        nonlocal sent
+        try:
+            sent += sock.send(request * 1000)
+        except BlockingIOError:
+            return any(session.paused for session in served.service.sessions)
+        return False
+
+    served.until(is_full)
+    return sent
+
+
 @pytest.fixture
 def serve(unique, tmp_path):
     """Starts servers."""
@@ -423,19 +441,7 @@ def test_who_never_takes_its_replies_delays_nobody_and_costs_bounded_memory(serv
         put(slow, "Twalk", ROOT, 1, ["large"])
         put(slow, "Tlopen", 1, 0)
         request = LINUX.encode[TYPES["Tread"]](2, 1, 0, 1 << 16)
-        slow.setblocking(False)
-        sent = 0
-
-        def is_full():
-            nonlocal sent
-            try:
-                sent += slow.send(request * 1000)
-            except BlockingIOError:
-                return any(session.paused for session in served.service.sessions)
-            return False
-
-        served.until(is_full)
-        asked = sent // len(request) << 16
+        asked = fill(served, slow, request) // len(request) << 16
         limit = served.service.tree.limits.unsent_bytes
 
         def unsent():
@@ -470,6 +476,15 @@ def test_the_stats_of_who_takes_no_replies_cost_bounded_memory(serve):
             tracemalloc.stop()
         works(served, honest)
         slow.close()
+
+
+def test_the_server_ends_though_one_takes_no_replies(serve):
+    with serve() as served:
+        slow = served.socket()
+        fill(served, slow, LINUX.encode[TYPES["Tgetattr"]](2, ROOT, 0x7FF))
+        service = served.service
+    assert service.sessions == set()
+    slow.close()
 
 
 def test_half_a_message_and_half_a_connection_delay_nobody(serve):
