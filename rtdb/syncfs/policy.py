@@ -21,6 +21,7 @@ class Limits:
     fids: int = 16_384  # of a connection: EMFILE
     writing: int = 1024  # of these open for writing: EMFILE
     draft_bytes: int = 32 << 20  # of a connection's unfinished revisions, the small ones apart: ENOSPC
+    reading_bytes: int = 64 << 20  # of revisions and listings that a connection has not finished reading: ENOMEM
     waiting: int = 16_384  # blocked stats of a connection: EAGAIN
     file_bytes: int = 4 << 20  # EFBIG
     files: int = 4096  # files and directories that clients made: ENOSPC

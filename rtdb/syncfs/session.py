@@ -46,6 +46,7 @@ DMAPPEND = 0x40000000
 SPECIAL = 0x02000000 | 0x01000000 | 0x00800000 | 0x00200000 | 0x00100000  # symlink, link, device, fifo, socket
 SET_MODE, SET_UID, SET_GID, SET_SIZE, SET_MTIME, SET_MTIME_TO = 0x1, 0x2, 0x4, 0x8, 0x20, 0x100
 SMALL_BYTES = 1 << 16  # drafts up to this size are not counted
+ENTRY_BYTES = 128  # of memory for an entry of a listing
 V9FS_MAGIC, BLOCK, AT_REMOVEDIR = 0x01021997, 4096, 0x200
 
 
@@ -60,13 +61,13 @@ class How(NamedTuple):
 class Fid:
     """What a client calls a node by, and what it does with it."""
 
-    __slots__ = ("draft", "listing", "node", "opened", "pace", "pinned", "who")
+    __slots__ = ("draft", "n_kept", "node", "opened", "pace", "reading", "who")
 
     def __init__(self, node: Node, who: Who, pace: Pace) -> None:
         self.node, self.who, self.pace = node, who, pace
         self.opened: int | None = None  # O_RDONLY, O_WRONLY or O_RDWR
-        self.pinned: bytes | None = None  # the revision that is being read
-        self.listing: list[tuple[str, Node]] | bytes | None = None  # of a directory that is being read
+        self.reading: bytes | list[tuple[str, Node]] | None = None  # the revision, or the listing, that is being read
+        self.n_kept = 0  # about so many bytes it takes
         self.draft: Draft | None = None
 
 
@@ -93,6 +94,7 @@ class Session:
         self._fids: dict[int, Fid] = {}
         self._held: dict[int, None] = {}  # tags of stats that wait
         self._writing: dict[Fid, None] = {}  # open for writing, in the order of their opening
+        self._kept_bytes = 0  # of all that is being read
         self._dialect, self._msize = PLAIN, tree.limits.min_msize
         self._begun = False
         self.attached = False  # it has said who it is
@@ -194,6 +196,7 @@ class Session:
             self._waiting.cancel((self, tag))
         self._held.clear()
         self._fids.clear()
+        self._kept_bytes = 0
         for fid in self._writing:
             if isinstance(fid.node, File):
                 self._tree.abandoned(fid.node)
@@ -240,6 +243,7 @@ class Session:
         if fid is None:
             raise FsError(errno.EBADF, f"no fid {number}")
         self._writing.pop(fid, None)
+        self._kept_bytes -= fid.n_kept
         if fid.draft is not None and not is_gone(fid.node):  # what was written goes with it
             assert isinstance(fid.node, File)
             try:
@@ -327,13 +331,23 @@ class Session:
             if self._dialect is LINUX:
                 raise FsError(errno.EISDIR)
             return self._reply("Rread", tag, self._stats_of(fid, node, offset, count))
-        data = fid.pinned
-        if offset == 0 or data is None:
+        data = fid.reading
+        if offset == 0 or not isinstance(data, bytes):
             assert isinstance(node, File)
-            data = fid.pinned = self._tree.read(node, self._shown(fid), fid.who)
+            data = self._tree.read(node, self._shown(fid), fid.who)
+            self._keep(fid, data, len(data))
             if fid.who.component is not None:
                 self._tree.note_read(fid.who.component, node, self._shown(fid))
         return self._reply("Rread", tag, data[offset : offset + count])
+
+    def _keep(self, fid: Fid, reading: bytes | list[tuple[str, Node]] | None, n_bytes: int) -> None:
+        """Pin what is being read, until its next beginning or the clunk."""
+        self._kept_bytes -= fid.n_kept
+        fid.reading, fid.n_kept = None, 0
+        if self._kept_bytes + n_bytes > self._limits.reading_bytes:
+            raise FsError(errno.ENOMEM, f"open for reading may be {self._limits.reading_bytes} bytes together")
+        self._kept_bytes += n_bytes
+        fid.reading, fid.n_kept = reading, n_bytes
 
     def _write(self, tag: int, number: int, offset: int, data: bytes) -> bytes:
         fid = self._fid(number)
@@ -575,22 +589,26 @@ class Session:
         if fid.opened is None:
             raise FsError(errno.EBADF, "this fid is not open")
         cycle = self._cycle(fid)
-        if offset == 0 or not isinstance(fid.listing, list):
-            fid.listing = [(".", node), ("..", node.parent or node), *node.entries(cycle)]
-        rows = entry_rows(fid.listing, offset, cycle, min(count, self._msize - IO_HEADER))
+        listing = fid.reading
+        if offset == 0 or not isinstance(listing, list):
+            listing = [(".", node), ("..", node.parent or node), *node.entries(cycle)]
+            self._keep(fid, listing, ENTRY_BYTES * len(listing))
+        rows = entry_rows(listing, offset, cycle, min(count, self._msize - IO_HEADER))
         if not rows:
-            fid.listing = None  # it was read to its end
+            self._keep(fid, None, 0)  # it was read to its end
         return self._reply("Rreaddir", tag, rows)
 
     def _stats_of(self, fid: Fid, node: Directory, offset: int, count: int) -> bytes:
         """Give whole stats of a directory's entries, as the older dialects read them."""
-        if offset == 0 or not isinstance(fid.listing, bytes):
+        stats = fid.reading
+        if offset == 0 or not isinstance(stats, bytes):
             cycle = self._cycle(fid)
-            fid.listing = b"".join(
+            stats = b"".join(
                 stat_record(self._dialect, entry, name, attr_or_aged(entry, cycle, fid.who))
                 for name, entry in node.entries(cycle)
             )
-        return whole_stats(fid.listing, offset, count)
+            self._keep(fid, stats, len(stats))
+        return whole_stats(stats, offset, count)
 
     def _stat(self, tag: int, number: int) -> bytes | None:
         fid = self._fid(number)

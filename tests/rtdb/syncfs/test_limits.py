@@ -93,6 +93,49 @@ def test_too_many_blocked_stats_of_a_connection_are_eagain(make_rig):
     assert [fs.told(tag)["data_version"] for tag in tags] == [1] * 3
 
 
+def test_too_much_open_for_reading_is_enomem_until_some_is_closed(make_rig):
+    rig = make_rig(limits=Limits(reading_bytes=2500))
+    fs, other = rig.client(), rig.client()
+    fs.write("f", b"x" * 1000)
+    rig.edge()
+    first, second, third = (fs.open("f") for _ in range(3))
+    assert len(fs.pread(first, 0)) == len(fs.pread(second, 0)) == len(fs.pread(first, 0)) == 1000
+    assert refused(fs.pread, third, 0) == errno.ENOMEM
+    assert len(other.read("f")) == 1000, "another connection has its own room"
+    fs.write("f", b"y" * 2000)
+    rig.edge()
+    assert refused(fs.pread, first, 0) == errno.ENOMEM, "it began again, and what it had is gone"
+    fs.clunk(second)
+    assert fs.pread(third, 0) == b"y" * 2000
+    fs.call("Tversion", fs.msize, "9P2000.L", tag=0xFFFF)
+    fs.attach(ROOT)
+    assert fs.read("f") == b"y" * 2000, "a new beginning holds nothing"
+
+
+@pytest.mark.parametrize("dialect", ["9P2000.u", "9P2000.L"])
+def test_too_many_open_listings_are_enomem_until_they_are_read(make_rig, dialect):
+    rig = make_rig(limits=Limits(reading_bytes=3000))
+    rig.client().mkdir("d")
+    for k in range(10):
+        rig.client().write(f"d/{k}", b"")
+    rig.edge()
+    fs = rig.client(dialect)
+
+    def begin():
+        fid = fs.open("d")
+        fs.call("Treaddir" if fs.linux else "Tread", fid, 0, 200)
+        return fid
+
+    def begin_all():
+        while len(begun) < 100:
+            begun.append(begin())
+
+    begun = [begin()]
+    assert refused(begin_all) == errno.ENOMEM
+    fs.clunk(begun[0])
+    begin()
+
+
 @pytest.mark.parametrize("dialect", ["9P2000.u", "9P2000.L"])
 def test_too_large_a_file_is_efbig_and_what_was_there_stays(make_rig, dialect):
     rig = make_rig(limits=Limits(file_bytes=1000))
@@ -564,6 +607,21 @@ def test_one_connection_too_many_is_closed_at_once_and_the_others_stay(serve):
         with served.client() as again:
             assert "clock" in again.ls()
         more.pop().close()
+
+
+def test_a_connection_that_does_not_attach_in_time_is_closed_and_who_has_attached_stays(serve, monkeypatch):
+    monkeypatch.setattr("rtdb.syncfs.server.ATTACH_S", 0.0)
+    monkeypatch.setattr("rtdb.syncfs.server.LOOK_S", 0.0)
+    with serve() as served:
+        silent = socket.socket(socket.AF_UNIX)
+        silent.settimeout(LONG_S)
+        silent.connect(str(served.address.path))
+        assert silent.recv(1) == b""
+        silent.close()
+        monkeypatch.setattr("rtdb.syncfs.server.ATTACH_S", 1e9)
+        with served.client() as honest:
+            monkeypatch.setattr("rtdb.syncfs.server.ATTACH_S", 0.0)
+            works(served, honest, rounds=1)
 
 
 def test_a_connection_that_sends_nonsense_is_closed_alone(serve):

@@ -979,6 +979,54 @@ def test_a_directory_read_with_too_little_room_is_refused_not_ended(fs):
     assert refused(fs.call, "Treaddir", fid, 0, 10) == errno.EINVAL
 
 
+@pytest.mark.parametrize("dialect", ["9P2000", "9P2000.u"])
+def test_a_directory_is_read_from_where_the_last_read_ended(make_rig, dialect):
+    fs = make_rig().client(dialect)
+    fid = fs.open("")
+    first = fs.pread(fid, 0, 100)
+    for offset in (1, len(first) - 1, len(first) + 1, 1 << 40):
+        with pytest.raises(Refused) as caught:
+            fs.pread(fid, offset)
+        assert caught.value.code == (errno.EINVAL if dialect == "9P2000.u" else 0)
+    pieces = [first]
+    while pieces[-1]:
+        pieces.append(fs.pread(fid, sum(map(len, pieces)), 100))
+    assert b"".join(pieces) == fs.pread(fid, 0)
+
+
+@pytest.mark.parametrize("dialect", ["9P2000", "9P2000.u"])
+def test_nothing_is_removed_by_a_close_and_who_asks_for_that_is_refused(make_rig, dialect):
+    rig = make_rig()
+    fs, reader = rig.client(dialect), rig.client()
+    reader.write("f", b"precious")
+    rig.edge()
+    orclose = 0x40
+    more = ("",) if dialect == "9P2000.u" else ()
+    for name, values in (("Topen", (fs.walk("f"), orclose)), ("Tcreate", (fs.walk(""), "g", 0o644, orclose, *more))):
+        with pytest.raises(Refused) as caught:
+            fs.call(name, *values)
+        assert caught.value.code == (errno.EOPNOTSUPP if dialect == "9P2000.u" else 0)
+    rig.edge()
+    assert (reader.read("f"), "g" in reader.ls()) == (b"precious", False)
+
+
+def test_a_create_that_finds_the_file_truncates_it_if_it_says_so(rig, fs):
+    fs.write("f", b"a long content")
+    rig.edge()
+    kept = fs.create("f", O_WRONLY)
+    fs.pwrite(kept, b"LONG", 2)
+    fs.clunk(kept)
+    rig.edge()
+    assert fs.read("f") == b"a LONG content"
+    cut = fs.create("f", O_WRONLY | O_TRUNC)
+    fs.pwrite(cut, b"short", 2)
+    rig.edge()
+    assert fs.read("f") == b"a LONG content", "until its close"
+    fs.clunk(cut)
+    rig.edge()
+    assert fs.read("f") == b"\0\0short"
+
+
 def test_a_directory_that_changes_while_it_is_read_repeats_and_loses_no_name(fs):
     for k in range(20):
         fs.mkdir(f"d{k}")
