@@ -4,7 +4,6 @@ One handler per message, guards first. A handler returns the reply, raises what 
 or returns None for a stat of a clock, which is answered at the next edge. Replies may overtake each other.
 """
 
-import contextlib
 import errno
 import logging
 import math
@@ -20,7 +19,6 @@ from .codec import (
     IO_HEADER,
     LINUX,
     NO_UID,
-    NOFID,
     PLAIN,
     TYPES,
     UNIX,
@@ -30,9 +28,10 @@ from .codec import (
 )
 from .draft import Draft
 from .errors import FsError, errno_of
-from .nodes import ClockFile, Directory, File, FreeDir, FreeFile, Node, StatusFile
+from .fids import Fid, Fids, is_gone
+from .nodes import ClockFile, Directory, File, FreeDir, FreeFile, Node
 from .pace import Pace
-from .policy import Tokens, Who
+from .policy import Tokens
 from .seats import Seat
 from .stats import DMDIR, Wstat, attr_or_aged, entry_rows, name_of, qid_of, stat_record, whole_stats
 from .tree import Tree
@@ -45,7 +44,6 @@ OREAD, OWRITE, ORDWR, OEXEC, OTRUNC, ORCLOSE, OAPPEND = 0, 1, 2, 3, 0x10, 0x40, 
 DMAPPEND = 0x40000000
 SPECIAL = 0x02000000 | 0x01000000 | 0x00800000 | 0x00200000 | 0x00100000  # symlink, link, device, fifo, socket
 SET_MODE, SET_UID, SET_GID, SET_SIZE, SET_MTIME, SET_MTIME_TO = 0x1, 0x2, 0x4, 0x8, 0x20, 0x100
-SMALL_BYTES = 1 << 16  # drafts up to this size are not counted
 ENTRY_BYTES = 128  # of memory for an entry of a listing
 V9FS_MAGIC, BLOCK, AT_REMOVEDIR = 0x01021997, 4096, 0x200
 
@@ -56,24 +54,6 @@ class How(NamedTuple):
     access: int  # O_RDONLY, O_WRONLY or O_RDWR
     append: bool
     truncate: bool = False
-
-
-class Fid:
-    """What a client calls a node by, and what it does with it."""
-
-    __slots__ = ("draft", "n_kept", "node", "opened", "pace", "reading", "who")
-
-    def __init__(self, node: Node, who: Who, pace: Pace) -> None:
-        self.node, self.who, self.pace = node, who, pace
-        self.opened: int | None = None  # O_RDONLY, O_WRONLY or O_RDWR
-        self.reading: bytes | list[tuple[str, Node]] | None = None  # the revision, or the listing, that is being read
-        self.n_kept = 0  # about so many bytes it takes
-        self.draft: Draft | None = None
-
-
-def is_gone(node: Node) -> bool:
-    """Whether a file was removed while somebody has it open."""
-    return isinstance(node, FreeFile) and node.gone
 
 
 class Session:
@@ -91,10 +71,8 @@ class Session:
         self._tree, self._waiting, self._tokens, self._send, self._trace = tree, waiting, tokens, send, trace
         self._limits, self._core = tree.limits, tree.store.core
         self._buffer = bytearray()
-        self._fids: dict[int, Fid] = {}
+        self._fids = Fids(tree)
         self._held: dict[int, None] = {}  # tags of stats that wait
-        self._writing: dict[Fid, None] = {}  # open for writing, in the order of their opening
-        self._kept_bytes = 0  # of all that is being read
         self._dialect, self._msize = PLAIN, tree.limits.min_msize
         self._begun = False
         self.attached = False  # it has said who it is
@@ -178,12 +156,7 @@ class Session:
 
     def edge(self) -> None:
         """An edge of the tree's pace has come."""
-        for fid in list(self._writing):
-            if fid.draft is not None and fid.draft.dirty:
-                try:
-                    fid.draft.edge()
-                except RtdbError as error:
-                    log.debug("not committed: %s", error)
+        self._fids.edge()
 
     def close(self) -> None:
         """The connection is over: fids and held stats go with it, and revisions that are not finished."""
@@ -196,28 +169,10 @@ class Session:
             self._waiting.cancel((self, tag))
         self._held.clear()
         self._fids.clear()
-        self._kept_bytes = 0
-        for fid in self._writing:
-            if isinstance(fid.node, File):
-                self._tree.abandoned(fid.node)
-        self._writing.clear()
         for seat in self._tree.seats.values():
             seat.rise(self)
 
     # -- fids -----------------------------------------------------------------------------------------------------
-
-    def _fid(self, number: int) -> Fid:
-        fid = self._fids.get(number)
-        if fid is None:
-            raise FsError(errno.EBADF, f"no fid {number}")
-        return fid
-
-    def _new_fid(self, number: int, fid: Fid) -> None:
-        if number in self._fids or number == NOFID:
-            raise FsError(errno.EBADF, f"fid {number} is in use")
-        if len(self._fids) >= self._limits.fids:
-            raise FsError(errno.EMFILE, f"{self._limits.fids} fids")
-        self._fids[number] = fid
 
     def _cycle(self, fid: Fid) -> int:
         """Give the cut that a mount sees: that of its last edge."""
@@ -236,20 +191,6 @@ class Session:
         else:
             version = fid.pace.last(cycle)
         return qid_of(node, version)
-
-    def _drop(self, number: int) -> None:
-        """Clunk: the draft is finished, the fid is gone whatever comes of it."""
-        fid = self._fids.pop(number, None)
-        if fid is None:
-            raise FsError(errno.EBADF, f"no fid {number}")
-        self._writing.pop(fid, None)
-        self._kept_bytes -= fid.n_kept
-        if fid.draft is not None and not is_gone(fid.node):  # what was written goes with it
-            assert isinstance(fid.node, File)
-            try:
-                fid.draft.finish()
-            finally:
-                self._tree.abandoned(fid.node)
 
     # -- messages of all dialects ---------------------------------------------------------------------------------
 
@@ -271,12 +212,12 @@ class Session:
             raise FsError(errno.EACCES, "aname is no token of this server")
         tree = self._tree
         new = Fid(tree.root, who, tree.pace_of(who.component))
-        self._new_fid(fid, new)
+        self._fids.add(fid, new)
         if who.component is not None:
             try:
                 tree.seat_of(who.component).sit(self)
             except RtdbError:
-                del self._fids[fid]
+                self._fids.forget(fid)
                 raise
         self.attached = True
         return self._reply("Rattach", tag, self._qid(tree.root, new))
@@ -288,7 +229,7 @@ class Session:
         return self._reply("Rflush", tag)
 
     def _walk(self, tag: int, number: int, newfid: int, names: list[str]) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if newfid != number and newfid in self._fids:
             raise FsError(errno.EBADF, f"fid {newfid} is in use")
         if (names or newfid == number) and fid.opened is not None:
@@ -305,9 +246,9 @@ class Session:
             qids.append(self._qid(node, fid))
         new = Fid(node, fid.who, fid.pace)
         if newfid == number:
-            self._fids[number] = new
+            self._fids.replace(number, new)
         else:
-            self._new_fid(newfid, new)
+            self._fids.add(newfid, new)
         return self._reply("Rwalk", tag, qids)
 
     def _step(self, node: Node, name: str, cycle: int) -> Node:
@@ -322,7 +263,7 @@ class Session:
         return found
 
     def _read(self, tag: int, number: int, offset: int, count: int) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if fid.opened is None or fid.opened == OWRITE:
             raise FsError(errno.EBADF, "this fid is not open for reading")
         count = min(count, self._msize - IO_HEADER)
@@ -335,22 +276,13 @@ class Session:
         if offset == 0 or not isinstance(data, bytes):
             assert isinstance(node, File)
             data = self._tree.read(node, self._shown(fid), fid.who)
-            self._keep(fid, data, len(data))
+            self._fids.keep(fid, data, len(data))
             if fid.who.component is not None:
                 self._tree.note_read(fid.who.component, node, self._shown(fid))
         return self._reply("Rread", tag, data[offset : offset + count])
 
-    def _keep(self, fid: Fid, reading: bytes | list[tuple[str, Node]] | None, n_bytes: int) -> None:
-        """Pin what is being read, until its next beginning or the clunk."""
-        self._kept_bytes -= fid.n_kept
-        fid.reading, fid.n_kept = None, 0
-        if self._kept_bytes + n_bytes > self._limits.reading_bytes:
-            raise FsError(errno.ENOMEM, f"open for reading may be {self._limits.reading_bytes} bytes together")
-        self._kept_bytes += n_bytes
-        fid.reading, fid.n_kept = reading, n_bytes
-
     def _write(self, tag: int, number: int, offset: int, data: bytes) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if fid.draft is None or fid.opened == OREAD:
             raise FsError(errno.EBADF, "this fid is not open for writing")
         assert isinstance(fid.node, File)
@@ -360,29 +292,20 @@ class Session:
         end = draft.n_bytes + len(data) if draft.append else offset + len(data)
         try:
             self._tree.room_for(fid.node, end)
-            if end > SMALL_BYTES:
-                self._check_drafts(end - draft.n_bytes)
+            self._fids.check_room(end, draft.n_bytes)
             draft.write(offset, data)
         except RtdbError as error:
             draft.refused(offset, error)
             raise
         return self._reply("Rwrite", tag, len(data))
 
-    def _check_drafts(self, n_bytes: int) -> None:
-        """Refuse what would make the unfinished revisions of this connection too large together."""
-        if (
-            sum(fid.draft.n_bytes for fid in self._writing if fid.draft is not None) + n_bytes
-            > self._limits.draft_bytes
-        ):
-            raise FsError(errno.ENOSPC, f"unfinished revisions may take {self._limits.draft_bytes} bytes together")
-
     def _clunk(self, tag: int, number: int) -> bytes:
-        self._drop(number)
+        self._fids.drop(number)
         return self._reply("Rclunk", tag)
 
     def _remove(self, tag: int, number: int) -> bytes:
-        fid = self._fid(number)
-        self._drop(number)
+        fid = self._fids[number]
+        self._fids.drop(number)
         self._remove_node(fid.node)
         return self._reply("Rremove", tag)
 
@@ -406,10 +329,9 @@ class Session:
                 raise FsError(errno.EISDIR)
             assert isinstance(node, File)
             node.check_write(fid.who)
-            if len(self._writing) >= self._limits.writing:
-                raise FsError(errno.EMFILE, f"{self._limits.writing} files are open for writing")
+            self._fids.check_one_more()
             who = fid.who
-            fid.draft = Draft(
+            draft = Draft(
                 node.base,
                 lambda data: node.commit(data, who),  # not the fid, which holds the draft
                 append=append,
@@ -418,9 +340,9 @@ class Session:
                 is_whole=node.is_whole,
                 created=created,
             )
-            self._writing[fid] = None
+            self._fids.begin(fid, draft)
             if truncate:
-                fid.draft.truncate(0)
+                draft.truncate(0)
         fid.opened = access
 
     def _create(self, fid: Fid, name: str, mode: int, gid: int, how: How, *, exclusive: bool) -> Node:
@@ -440,7 +362,7 @@ class Session:
         return fresh
 
     def _lopen(self, tag: int, number: int, flags: int) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if flags & O_DIRECTORY and not fid.node.is_dir:
             raise FsError(errno.ENOTDIR)
         truncate = bool(flags & O_TRUNC) and flags & O_ACCESS != OREAD
@@ -448,14 +370,14 @@ class Session:
         return self._reply("Rlopen", tag, self._qid(fid.node, fid), 0)
 
     def _lcreate(self, tag: int, number: int, name: str, flags: int, mode: int, gid: int) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         truncate = bool(flags & O_TRUNC) and flags & O_ACCESS != OREAD
         how = How(flags & O_ACCESS, bool(flags & O_APPEND), truncate)
         node = self._create(fid, name, mode, gid, how, exclusive=bool(flags & O_EXCL))
         return self._reply("Rlcreate", tag, self._qid(node, fid), 0)
 
     def _open(self, tag: int, number: int, mode: int) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if mode & ORCLOSE:
             raise FsError(errno.EOPNOTSUPP, "nothing is removed by a close")
         access = OREAD if mode & 3 == OEXEC else mode & 3
@@ -464,7 +386,7 @@ class Session:
         return self._reply("Ropen", tag, self._qid(fid.node, fid), 0)
 
     def _tcreate(self, tag: int, number: int, name: str, perm: int, mode: int, _extension: str = "") -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if perm & SPECIAL:
             raise FsError(errno.EOPNOTSUPP, "there are files and directories")
         if mode & ORCLOSE:
@@ -486,7 +408,7 @@ class Session:
     # -- what a stat tells ----------------------------------------------------------------------------------------
 
     def _getattr(self, tag: int, number: int, mask: int) -> bytes | None:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if mask & ALL == ALL and isinstance(fid.node, ClockFile):
             self._hold(tag, fid, fid.node, lambda: self._attributes(tag, fid))
             return None
@@ -509,7 +431,7 @@ class Session:
         seat: Seat | None = None
         if clock.component is not None and fid.who.may_write(clock.component):
             seat = self._tree.seat_of(clock.component)
-            self._finish_what_is_open()
+            self._fids.finish()
         asked = pace.last(self._core.cycle)
         woken = self._woken.get(pace)
         if woken is not None and asked > woken:
@@ -529,20 +451,11 @@ class Session:
         self._held[tag] = None
         self._waiting.add((self, tag), pace, Waiter(asked, seat, time.monotonic(), answer))
 
-    def _finish_what_is_open(self) -> None:
-        """Make revisions of what a component keeps open, as it says that it is done; not of half a long write."""
-        for fid in self._writing:
-            draft = fid.draft
-            if draft is None or draft.truncated or (draft.is_under_way and not isinstance(fid.node, StatusFile)):
-                continue
-            with contextlib.suppress(RtdbError):  # the component's health says so
-                draft.finish()
-
     def _setattr(
         self, tag: int, number: int, valid: int, mode: int, uid: int, gid: int, size: int,
         _at_s: int, _at_ns: int, mt_s: int, mt_ns: int,
     ) -> bytes:  # fmt: skip
-        fid = self._fid(number)
+        fid = self._fids[number]
         if valid & SET_SIZE:
             self._truncate(fid, size)
         mtime_ns = None
@@ -567,22 +480,21 @@ class Session:
             raise FsError(errno.EISDIR)
         node.check_write(fid.who)
         self._tree.room_for(node, size)
-        if size > SMALL_BYTES:
-            self._check_drafts(size)
+        self._fids.check_room(size)
         if fid.draft is not None:
             fid.draft.truncate(size)
             return
-        for other in reversed(self._writing):  # Linux asks for it by another fid than the one that it has opened
-            if other.node is node and other.draft is not None and other.draft.pristine:
-                other.draft.truncate(size)
-                return
+        draft = self._fids.pristine(node)  # Linux asks for it by another fid than the one that it has opened
+        if draft is not None:
+            draft.truncate(size)
+            return
         data = node.base()[:size]
         node.commit(data + bytes(size - len(data)), fid.who)
 
     # -- directories ----------------------------------------------------------------------------------------------
 
     def _readdir(self, tag: int, number: int, offset: int, count: int) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         node = fid.node
         if not isinstance(node, Directory):
             raise FsError(errno.ENOTDIR)
@@ -592,10 +504,10 @@ class Session:
         listing = fid.reading
         if offset == 0 or not isinstance(listing, list):
             listing = [(".", node), ("..", node.parent or node), *node.entries(cycle)]
-            self._keep(fid, listing, ENTRY_BYTES * len(listing))
+            self._fids.keep(fid, listing, ENTRY_BYTES * len(listing))
         rows = entry_rows(listing, offset, cycle, min(count, self._msize - IO_HEADER))
         if not rows:
-            self._keep(fid, None, 0)  # it was read to its end
+            self._fids.keep(fid, None, 0)  # it was read to its end
         return self._reply("Rreaddir", tag, rows)
 
     def _stats_of(self, fid: Fid, node: Directory, offset: int, count: int) -> bytes:
@@ -607,11 +519,11 @@ class Session:
                 stat_record(self._dialect, entry, name, attr_or_aged(entry, cycle, fid.who))
                 for name, entry in node.entries(cycle)
             )
-            self._keep(fid, stats, len(stats))
+            self._fids.keep(fid, stats, len(stats))
         return whole_stats(stats, offset, count)
 
     def _stat(self, tag: int, number: int) -> bytes | None:
-        fid = self._fid(number)
+        fid = self._fids[number]
 
         def made() -> bytes:
             attr = fid.node.attr(self._shown(fid), fid.who)
@@ -623,7 +535,7 @@ class Session:
         return made()
 
     def _wstat(self, tag: int, number: int, record: bytes) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         asked = Wstat.parse(self._dialect, record)
         if asked.length is not None:
             self._truncate(fid, asked.length)
@@ -648,7 +560,7 @@ class Session:
     # -- messages of Linux' dialect -------------------------------------------------------------------------------
 
     def _statfs(self, tag: int, number: int) -> bytes:
-        self._fid(number)
+        self._fids[number]
         size, unused = self._tree.store.memory
         limits, names = self._limits, self._tree.names
         free = unused // BLOCK
@@ -658,46 +570,46 @@ class Session:
         )  # fmt: skip
 
     def _mkdir(self, tag: int, number: int, name: str, mode: int, gid: int) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if not isinstance(fid.node, Directory):
             raise FsError(errno.ENOTDIR)
         node = self._tree.mkdir(fid.node, name, mode, fid.who, gid)
         return self._reply("Rmkdir", tag, self._qid(node, fid))
 
     def _unlinkat(self, tag: int, number: int, name: str, flags: int) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if not isinstance(fid.node, Directory):
             raise FsError(errno.ENOTDIR)
         self._tree.remove(fid.node, name, want_dir=bool(flags & AT_REMOVEDIR))
         return self._reply("Runlinkat", tag)
 
     def _renameat(self, tag: int, number: int, name: str, to: int, new: str) -> bytes:
-        old_dir, new_dir = self._fid(number).node, self._fid(to).node
+        old_dir, new_dir = self._fids[number].node, self._fids[to].node
         if not isinstance(old_dir, Directory) or not isinstance(new_dir, Directory):
             raise FsError(errno.ENOTDIR)
         self._tree.rename(old_dir, name, new_dir, new)
         return self._reply("Rrenameat", tag)
 
     def _rename(self, tag: int, number: int, to: int, name: str) -> bytes:
-        self._rename_node(self._fid(number).node, self._fid(to).node, name)
+        self._rename_node(self._fids[number].node, self._fids[to].node, name)
         return self._reply("Rrename", tag)
 
     def _fsync(self, tag: int, number: int, _datasync: int) -> bytes:
-        fid = self._fid(number)
+        fid = self._fids[number]
         if fid.draft is not None:
             fid.draft.sync()
         return self._reply("Rfsync", tag)
 
     def _lock(self, tag: int, number: int, *_what: Any) -> bytes:
-        self._fid(number)
+        self._fids[number]
         return self._reply("Rlock", tag, 0)  # granted: a single writer per file needs none
 
     def _getlock(self, tag: int, number: int, _type: int, start: int, length: int, pid: int, client: str) -> bytes:
-        self._fid(number)
+        self._fids[number]
         return self._reply("Rgetlock", tag, 2, start, length, pid, client)  # F_UNLCK
 
     def _readlink(self, _tag: int, number: int) -> bytes:
-        self._fid(number)
+        self._fids[number]
         raise FsError(errno.EINVAL, "there are no links")
 
     def _refuse(self, _tag: int, *_values: Any) -> bytes:

@@ -513,8 +513,9 @@ def test_result_behind_the_deadline_is_dropped_in_real_time(bad: Path) -> None:
         host.connect()
         store.run_clock(("bad",))
         host.component.done(0)
-        cycle = 0
-        while cycle < 33 and host.fault == "":
+        found = store.find("bad/status", ModuleStatus)
+        cycle, status = 0, None
+        while cycle < 1000 and host.fault == "":
             pose.write(Pose())
             now = store.wait_cycle(cycle, 10.0)
             assert now is not None
@@ -522,9 +523,10 @@ def test_result_behind_the_deadline_is_dropped_in_real_time(bad: Path) -> None:
                 if due == now or due % 4:  # what was slept through is over
                     host.step(due)
                 host.component.done(due)
-            cycle = now
+            cycle, status = now, found.latest()
+            if status is not None and status.value.state is ModuleState.LATE:
+                break  # sooner or later: a machine that stands still meanwhile makes the pose stale first
         state = store.find("bad/state", FollowState).latest()
-        status = store.find("bad/status", ModuleStatus).latest()
     assert status is not None
     assert status.value.state is ModuleState.LATE, status.value
     assert re.match(r"cycle \d+: \d+\.\d ms late, its result is dropped", status.value.reason)
