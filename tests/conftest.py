@@ -5,12 +5,19 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from steady import STEADY
 
 # No test is timed, and the same tree gives the same examples.
 settings.register_profile("fairway", deadline=None, derandomize=True)
 settings.load_profile("fairway")
 
 _BESIDE_CHECKOUT = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Watch the machine during tests in real time; called for each attempt."""
+    if item.get_closest_marker("flaky"):
+        STEADY.begin()
 
 
 @pytest.fixture(scope="session")

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import pytest
+from steady import real_time
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
@@ -144,7 +145,7 @@ class Session:
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=pytest.mark.proof) if page.name in REAL_TIME else page for page in PAGES],
+    [pytest.param(page, marks=[pytest.mark.proof, real_time]) if page.name in REAL_TIME else page for page in PAGES],
     ids=lambda page: page.name,
 )
 def test_everything_in_the_document_works(

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from steady import real_time
 
 from autonomy import contain
 from autonomy.host import Host
@@ -503,6 +504,7 @@ def test_budget_is_counted_and_nothing_else_changes(bad: Path) -> None:
     assert 0.06 <= timing.last_s <= timing.longest_s
 
 
+@real_time
 def test_result_behind_the_deadline_is_dropped_in_real_time(bad: Path) -> None:
     """The only clock that does not wait: ticks of 50 ms, a budget of 20 ms, steps of 60 ms after the third."""
     store = Store.create(name_of("real"), clock="real", tick_ns=50_000_000)

@@ -67,6 +67,8 @@ class LiveRun:
         """Wait until something is so, looking at each tick, or each time somebody comes or goes."""
         deadline_s = time.monotonic() + LONG_S
         while not is_so():
+            ended = self.process.poll() is not None and not is_so()
+            assert not ended, self.printed
             assert time.monotonic() < deadline_s, self.printed
             if self.store.wait_cycle(self.store.cycle, 0.1) is None:
                 self.store.core.wait_directory(self.store.core.version, 10_000_000)

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from live_run import LiveRun
+from steady import real_time
 from typer.testing import CliRunner
 
 from autonomy.wiring import load_stack
@@ -229,6 +230,7 @@ with Client.connect(sys.argv[1], sys.argv[2]) as fs:
 """
 
 
+@real_time
 @pytest.mark.proof
 def test_a_running_cart_is_wired_to_a_script_and_stands_when_the_script_dies(tmp_path: Path) -> None:
     live = LiveRun(tmp_path, metres=100)
@@ -256,6 +258,7 @@ def test_a_running_cart_is_wired_to_a_script_and_stands_when_the_script_dies(tmp
         live.close()
 
 
+@real_time
 @pytest.mark.proof
 def test_a_script_drives_in_real_time(tmp_path: Path) -> None:
     words = ["run", "parking-lot/square", "--use", "follow=files", "--listen", f"unix:{tmp_path}/9p", "--for", "12"]

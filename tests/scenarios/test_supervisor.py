@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from live_run import LiveRun
+from steady import real_time
 
 from hal.signals import CartTruth
 from rtdb.recording import Recording
@@ -107,6 +108,7 @@ def test_ticks_that_were_slept_through_are_made_up_for_unless_the_safety_node_wo
 # -- processes ------------------------------------------------------------------------------------------------------
 
 
+@real_time
 @pytest.mark.proof
 def test_a_drive_arrives_in_real_time_restarts_who_is_not_needed_and_leaves_nothing_behind(live, tmp_path):
     stack = json.loads((STACKS / "reference.json").read_text())
@@ -130,6 +132,7 @@ def test_a_drive_arrives_in_real_time_restarts_who_is_not_needed_and_leaves_noth
     ends_well(run)
 
 
+@real_time
 @pytest.mark.proof
 def test_without_a_required_module_the_limits_stop_the_cart_and_it_is_not_restarted(live):
     run = live(metres=100)
@@ -144,6 +147,7 @@ def test_without_a_required_module_the_limits_stop_the_cart_and_it_is_not_restar
     ends_well(run)
 
 
+@real_time
 @pytest.mark.proof
 def test_without_the_supervisor_hal_stops_the_cart_and_all_processes_end(live):
     run = live(metres=100)
@@ -155,6 +159,7 @@ def test_without_the_supervisor_hal_stops_the_cart_and_all_processes_end(live):
     it_drove_and_stands(run)
 
 
+@real_time
 @pytest.mark.proof
 def test_without_the_clock_hal_stops_the_cart_on_its_own_time(live):
     run = live(metres=100)
@@ -166,6 +171,7 @@ def test_without_the_clock_hal_stops_the_cart_on_its_own_time(live):
     ends_well(run)
 
 
+@real_time
 @pytest.mark.proof
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_who_ends_the_run_stops_the_cart_first(live, number):
@@ -179,6 +185,7 @@ def test_who_ends_the_run_stops_the_cart_first(live, number):
     ends_well(run)
 
 
+@real_time
 @pytest.mark.proof
 def test_required_module_that_hangs_is_named_and_the_cart_stands(live, tmp_path):
     stack = json.loads((STACKS / "reference.json").read_text())
