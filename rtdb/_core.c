@@ -5,6 +5,9 @@
 #include <Python.h>
 #include <sys/mman.h>
 
+#undef Py_RETURN_NONE /* the headers of 3.12 and later take None for immortal, and in 3.11 it is not */
+#define Py_RETURN_NONE return Py_NewRef(Py_None)
+
 #include "core/fw_layout.h"
 
 #ifndef FW_SOURCE_HASH

@@ -5,6 +5,9 @@
 #include <Python.h>
 #include <string.h>
 
+#undef Py_RETURN_NONE /* the headers of 3.12 and later take None for immortal, and in 3.11 it is not */
+#define Py_RETURN_NONE return Py_NewRef(Py_None)
+
 #include "kernel/fw_plant.h"
 #include "kernel/trig.h"
 

@@ -10,6 +10,7 @@ import random
 import re
 import struct
 import subprocess
+import sys
 import tracemalloc
 from array import array
 from collections.abc import Callable, Iterator
@@ -529,3 +530,11 @@ def test_without_a_ground_the_cart_is_on_the_flat() -> None:
         other.step(Demand(drive=1.0), FLAT)
     assert plant.state == other.state
     assert plant.state.vx_mps > 0.2
+
+
+def test_calls_that_return_none_keep_its_reference_count() -> None:
+    """As that of the store's core, in `tests/rtdb/test_core_is_fresh.py`."""
+    plant, before = CompiledPlant(CARTS[0]), sys.getrefcount(None)
+    for _ in range(1000):
+        plant.step(Demand(0.1, 0.0, 0.5))
+    assert sys.getrefcount(None) > before - 500
