@@ -163,7 +163,7 @@ class Connection(asyncio.Protocol):
             transport.abort()
             return
         server.connections.add(self)
-        self.session = server.service.begin(transport.write)
+        self.session = server.service.begin(self._send)
         transport.set_write_buffer_limits(high=limits.unsent_bytes)
         if not self._unix:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -171,6 +171,12 @@ class Connection(asyncio.Protocol):
             for option, value in ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3)):
                 sock.setsockopt(socket.IPPROTO_TCP, option, value)
             self._quick = sock.setsockopt
+
+    def _send(self, data: bytes) -> None:
+        """Send a reply, unless the client went in the middle of a batch."""
+        assert self._transport is not None
+        if not self._transport.is_closing():
+            self._transport.write(data)
 
     def data_received(self, data: bytes) -> None:
         """Answer what came. Linux' client has no TCP_NODELAY: without quick acknowledgement its next request waits."""

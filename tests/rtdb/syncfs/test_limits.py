@@ -5,6 +5,8 @@ import contextlib
 import errno
 import gc
 import socket
+import subprocess
+import sys
 import threading
 import time
 import tracemalloc
@@ -548,52 +550,68 @@ def test_half_a_message_and_half_a_connection_delay_nobody(serve):
         served.until(lambda: len(served.server.connections) == 1)
 
 
+FLOOD = """
+import socket, sys
+path, hello, request, n_bytes = sys.argv[1], *map(bytes.fromhex, sys.argv[2:4]), int(sys.argv[4])
+flood = socket.socket(socket.AF_UNIX)
+flood.connect(path)
+flood.sendall(hello)
+flood.recv(4096)
+print(flush=True)
+flood.setblocking(n_bytes > 0)
+while True:
+    try:
+        flood.send(request)
+        left = n_bytes or 1
+        while left > 0:
+            left -= len(flood.recv(1 << 20))
+    except BlockingIOError:
+        pass
+"""
+
+
+@contextlib.contextmanager
+def flooded(served, request, n_bytes):
+    """Have another process send as fast as it can. n_bytes: of replies, that it takes before it goes on; 0: any."""
+    encode = LINUX.encode
+    hello = encode[TYPES["Tversion"]](NOTAG, 1 << 17, "9P2000.L") + encode[TYPES["Tattach"]](1, ROOT, NOFID, "", "", 0)
+    words = [str(served.address.path), hello.hex(), request.hex(), str(n_bytes)]
+    with subprocess.Popen([sys.executable, "-S", "-c", FLOOD, *words], stdout=subprocess.PIPE) as child:
+        try:
+            child.stdout.readline()
+            before = served.ask(lambda: served.service.report()["requests"])
+            yield
+            assert served.ask(lambda: served.service.report()["requests"]) > before + 1000, "it was no flood"
+        finally:
+            child.kill()
+
+
 def test_a_flood_of_requests_starves_nobody(serve):
     """While one sends as fast as it can, another is woken by each edge."""
-    with serve() as served, served.client() as honest:
-        stop, counts, flood = threading.Event(), [0], served.socket()
-        request = LINUX.encode[TYPES["Tgetattr"]](2, ROOT, 0x7FF) * 50
-
-        def drown():
-            while not stop.is_set():
-                flood.sendall(request)
-                for _ in range(50):
-                    take(flood)
-                counts[0] += 50
-
-        thread = threading.Thread(target=drown)
-        thread.start()
-        try:
+    request = LINUX.encode[TYPES["Tgetattr"]](2, ROOT, 0x7FF)
+    with serve() as served, served.client() as honest, served.socket() as other:
+        other.sendall(request)
+        n_bytes = len(other.recv(4096))
+        with flooded(served, request * 50, 50 * n_bytes):
             works(served, honest, rounds=5)
-        finally:
-            stop.set()
-            thread.join(LONG_S)
-            flood.close()
-        assert counts[0]
 
 
 def test_a_flood_that_does_not_wait_for_replies_starves_nobody(serve):
     with serve() as served, served.client() as honest:
-        flood, stop = served.socket(), threading.Event()
-        flood.settimeout(0.0)
-        request = LINUX.encode[TYPES["Tclunk"]](2, 99) * 1000
-
-        def drown():
-            while not stop.is_set():
-                try:
-                    flood.send(request)
-                    flood.recv(1 << 20)
-                except BlockingIOError:
-                    continue
-
-        thread = threading.Thread(target=drown)
-        thread.start()
-        try:
+        with flooded(served, LINUX.encode[TYPES["Tclunk"]](2, 99) * 1000, 0):
             works(served, honest)
-        finally:
-            stop.set()
-            thread.join(LONG_S)
+        served.until(lambda: len(served.server.connections) == 1)
+
+
+def test_who_goes_in_the_middle_of_a_flood_leaves_no_complaint(serve, caplog):
+    with serve() as served, served.client() as honest:
+        for _ in range(20):
+            flood = served.socket()
+            flood.sendall(LINUX.encode[TYPES["Tclunk"]](2, 99) * 2000)
             flood.close()
+        served.until(lambda: len(served.server.connections) == 1)
+        works(served, honest, rounds=1)
+    assert caplog.text == ""
 
 
 def test_one_connection_too_many_is_closed_at_once_and_the_others_stay(serve):
