@@ -193,8 +193,8 @@ class Connection(asyncio.Protocol):
     def _after(self, more: bool) -> None:
         """Let others have their turn before this client's next batch; it is not listened to meanwhile."""
         session, transport = self.session, self._transport
-        assert session is not None
-        assert transport is not None
+        if session is None or transport is None:
+            return
         if session.over or transport.is_closing():
             self.close()
         elif more:
@@ -221,10 +221,11 @@ class Connection(asyncio.Protocol):
             self._take_turn()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Everything that the connection held goes."""
+        """Everything that the connection held goes, and the ring of it and its session."""
         self._server.connections.discard(self)
-        if self.session is not None:
-            self._server.service.end(self.session)
+        session, self.session = self.session, None
+        if session is not None:
+            self._server.service.end(session)
 
     def close(self) -> None:
         """End it, once it has taken what was sent."""

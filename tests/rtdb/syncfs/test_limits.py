@@ -603,6 +603,22 @@ def test_a_flood_that_does_not_wait_for_replies_starves_nobody(serve):
         served.until(lambda: len(served.server.connections) == 1)
 
 
+def test_a_connection_that_has_ended_leaves_nothing_for_the_collector(serve):
+    """There is none in real time."""
+    with serve() as served, served.client() as honest:
+        gc.disable()
+        try:
+            other = served.socket()
+            sessions = served.ask(lambda: [weakref.ref(session) for session in served.service.sessions])
+            connections = served.ask(lambda: [weakref.ref(connection) for connection in served.server.connections])
+            other.close()
+            served.until(lambda: len(served.server.connections) == 1)
+            works(served, honest, rounds=1)
+            assert [sum(ref() is not None for ref in refs) for refs in (sessions, connections)] == [1, 1]
+        finally:
+            gc.enable()
+
+
 def test_who_goes_in_the_middle_of_a_flood_leaves_no_complaint(serve, caplog):
     with serve() as served, served.client() as honest:
         for _ in range(20):
