@@ -208,6 +208,20 @@ def test_trace_prints_every_message(serve, fairway, unique):
     ]  # fmt: skip
 
 
+def test_a_trace_that_nobody_reads_any_more_harms_nobody(serve, unique, tmp_path):
+    address = f"unix:{tmp_path}/t"
+    process, _ = serve("--db", unique(), "--trace", "--listen", address)
+    process.stderr.close()  # as `fairway serve --trace 2>&1 | head` does
+    with Client.connect(address) as client:
+        client.write("/f", b"content")
+        assert "f" in client.ls()
+    with Client.connect(address) as another:
+        assert "f" in another.ls()
+    process.stderr = None
+    process.send_signal(signal.SIGTERM)
+    assert process.wait() == 0
+
+
 def test_a_barrier_store_waits_for_its_components(serve, unique, tmp_path):
     db, address = unique(), f"unix:{tmp_path}/b"
     serve("--db", db, "--clock", "barrier", "--listen", address, "--component", "a:1", "--component", "b:1",
