@@ -26,9 +26,38 @@ from .session import Session
 log = logging.getLogger(__name__)
 LOOK_S = 0.25  # between looks at what stands still
 BATCH, TURN_S = 64, 0.002  # so many messages of one client are answered in a row, for so long at most
+JOINED_BYTES = 1 << 16  # replies are joined up to this size
 STORE_S = 2.0  # between looks whether the store is still there
 ATTACH_S = 10.0  # for a connection to say who it is
 _CREDENTIALS = struct.Struct("3i")
+
+
+class Outgoing:
+    """Replies on their way: those to one connection in a row are one write.
+
+    Many small writes to a client that does not take them are slow: since Python 3.12 a transport adds up the lengths of
+    all that it holds at each of them.
+    """
+
+    def __init__(self) -> None:
+        self._to: Connection | None = None
+        self._replies: list[bytes] = []
+        self._n_bytes = 0
+
+    def add(self, to: "Connection", reply: bytes) -> None:
+        """Take a reply; whoever began what led to it calls `flush` in the end."""
+        if self._to is not to or self._n_bytes > JOINED_BYTES:
+            self.flush()
+            self._to = to
+        self._replies.append(reply)
+        self._n_bytes += len(reply)
+
+    def flush(self) -> None:
+        """Write what is left."""
+        to, replies = self._to, self._replies
+        self._to, self._replies, self._n_bytes = None, [], 0
+        if to is not None:
+            to.write(replies[0] if len(replies) == 1 else b"".join(replies))
 
 
 class FileServer:
@@ -42,6 +71,7 @@ class FileServer:
             self.store.close()
             raise
         self.connections: set[Connection] = set()
+        self.outgoing = Outgoing()
         self._servers: list[asyncio.AbstractServer] = []
         self._sockets: list[Path] = []
         self._edges: Edges | None = None
@@ -122,10 +152,12 @@ class FileServer:
         assert self._edges is not None
         self._edges.clear()
         self.service.edge(time.monotonic())
+        self.outgoing.flush()
 
     def _look_around(self) -> None:
         now_s = time.monotonic()
         self.service.look(now_s)
+        self.outgoing.flush()
         if now_s - self._looked_s > STORE_S:
             self._looked_s = now_s
             self._look_for_store()
@@ -163,7 +195,7 @@ class Connection(asyncio.Protocol):
             transport.abort()
             return
         server.connections.add(self)
-        self.session = server.service.begin(self._send)
+        self.session = server.service.begin(lambda reply: server.outgoing.add(self, reply))
         transport.set_write_buffer_limits(high=limits.unsent_bytes)
         if not self._unix:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -172,8 +204,8 @@ class Connection(asyncio.Protocol):
                 sock.setsockopt(socket.IPPROTO_TCP, option, value)
             self._quick = sock.setsockopt
 
-    def _send(self, data: bytes) -> None:
-        """Send a reply, unless the client went in the middle of a batch."""
+    def write(self, data: bytes) -> None:
+        """Send replies, unless the client went in the middle of a batch."""
         assert self._transport is not None
         if not self._transport.is_closing():
             self._transport.write(data)
@@ -192,6 +224,7 @@ class Connection(asyncio.Protocol):
 
     def _after(self, more: bool) -> None:
         """Let others have their turn before this client's next batch; it is not listened to meanwhile."""
+        self._server.outgoing.flush()
         session, transport = self.session, self._transport
         if session is None or transport is None:
             return
@@ -226,6 +259,7 @@ class Connection(asyncio.Protocol):
         session, self.session = self.session, None
         if session is not None:
             self._server.service.end(session)
+            self._server.outgoing.flush()
 
     def close(self) -> None:
         """End it, once it has taken what was sent."""
