@@ -20,7 +20,7 @@ class Steady:
 
     def __init__(self) -> None:
         self._threads: list[threading.Thread] = []
-        self.latest_s = 0.0  # since the beginning
+        self.worst_s = 0.0  # lateness since the beginning
 
     def begin(self) -> None:
         """Begin anew: what was before does not count."""
@@ -29,18 +29,18 @@ class Steady:
                 thread = threading.Thread(target=self._watch, args=(cpu,), name=f"watch-{cpu}", daemon=True)
                 self._threads.append(thread)
                 thread.start()
-        self.latest_s = 0.0
+        self.worst_s = 0.0
 
     def _watch(self, cpu: int) -> None:
         os.sched_setaffinity(threading.get_native_id(), {cpu})
         while True:
             due_s = time.monotonic() + LOOK_S
             time.sleep(LOOK_S)
-            self.latest_s = max(self.latest_s, time.monotonic() - due_s)
+            self.worst_s = max(self.worst_s, time.monotonic() - due_s)
 
     def stood_still(self) -> bool:
         """Whether a CPU woke up late since the beginning."""
-        return self.latest_s > LATE_S
+        return self.worst_s > LATE_S
 
 
 STEADY = Steady()

@@ -18,6 +18,7 @@ from rtdb import Store
 from rtdb.json_object import json_schema
 from rtdb.syncfs import Address, Client, FileServer, FsError, Limits, SeatSpec, Tokens
 from rtdb.syncfs.codec import LINUX, NOFID, NOTAG, TYPES
+from rtdb.syncfs.server import JOINED_BYTES, Outgoing
 
 from .conftest import O_APPEND, O_TRUNC, O_WRONLY, ROOT, Refused
 
@@ -619,7 +620,29 @@ def test_a_connection_that_has_ended_leaves_nothing_for_the_collector(serve):
             gc.enable()
 
 
-def test_who_goes_in_the_middle_of_a_flood_leaves_no_complaint(serve, caplog):
+class Sink:
+    """Stands for a connection: keeps what is written."""
+
+    def __init__(self):
+        self.writes = []
+        self.write = self.writes.append
+
+
+def test_replies_to_one_client_in_a_row_are_one_write_up_to_a_size():
+    outgoing, one, other = Outgoing(), Sink(), Sink()
+    for to, reply in ((one, b"1"), (one, b"2"), (other, b"3"), (one, b"4")):
+        outgoing.add(to, reply)
+    outgoing.flush()
+    outgoing.flush()
+    assert (one.writes, other.writes) == ([b"12", b"4"], [b"3"])
+    for _ in range(10):
+        outgoing.add(other, bytes(JOINED_BYTES))
+    outgoing.flush()
+    assert [len(data) for data in other.writes[1:]] == [2 * JOINED_BYTES] * 5
+
+
+def test_who_goes_in_the_middle_of_a_flood_leaves_no_complaint(serve, caplog, monkeypatch):
+    monkeypatch.setattr("rtdb.syncfs.server.JOINED_BYTES", 0)  # a write per reply
     with serve() as served, served.client() as honest:
         for _ in range(20):
             flood = served.socket()
