@@ -37,7 +37,6 @@ READABLE = [*PAGES, ROOT / "README.md"]
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 GENERATED = re.compile(r"(<!-- generated: ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 TIMEOUT_S = 120
-REAL_TIME = ("running.md",)  # nearly all of it runs in real time
 
 
 # -- running -------------------------------------------------------------------------------------------------------
@@ -54,6 +53,10 @@ class Block(NamedTuple):
 def blocks(page: Path) -> list[Block]:
     text = page.read_text()
     return [Block(m[1], m[2], text.count("\n", 0, m.start(2)) + 1) for m in FENCE.finditer(text)]
+
+
+def runs_in_real_time(page: Path) -> bool:
+    return any("\nfairway run " in f"\n{block.text}" for block in blocks(page) if block.language == "sh")
 
 
 class Session:
@@ -145,7 +148,7 @@ class Session:
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=[pytest.mark.proof, real_time]) if page.name in REAL_TIME else page for page in PAGES],
+    [pytest.param(page, marks=[pytest.mark.proof, real_time] if runs_in_real_time(page) else []) for page in PAGES],
     ids=lambda page: page.name,
 )
 def test_everything_in_the_document_works(
