@@ -269,7 +269,9 @@ def test_a_server_ends_with_its_store(serve, unique):
 def test_a_client_that_ran_into_its_time_limit_is_closed(serve, unique, tmp_path):
     address = f"unix:{tmp_path}/s"
     serve("--db", unique(), "--clock", "barrier", "--listen", address, "--component", "never")
-    client = Client.connect(address, timeout_s=0.01)
+    client = Client.connect(address, timeout_s=60.0)
+    assert client._sock.gettimeout() == 60.0
+    client._sock.settimeout(0.01)  # a limit that short might hit the connecting itself
     with pytest.raises(FsError) as caught:
         client.wait()
     assert caught.value.errno == errno.ETIMEDOUT
