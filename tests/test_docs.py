@@ -146,9 +146,10 @@ class Session:
         return wrong
 
 
+@real_time
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=[pytest.mark.proof, real_time] if runs_in_real_time(page) else []) for page in PAGES],
+    [pytest.param(page, marks=[pytest.mark.proof] if runs_in_real_time(page) else []) for page in PAGES],
     ids=lambda page: page.name,
 )
 def test_everything_in_the_document_works(

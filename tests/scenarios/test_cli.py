@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from steady import real_time
 
 from hal.signals import Odometry
 from rtdb import Store, StoreMissing
@@ -392,6 +393,7 @@ def running(tmp_path: Path) -> Iterator[Callable[..., Running]]:
         drive.end()
 
 
+@real_time
 def test_store_of_a_running_drive_can_be_looked_into_and_is_not_given_twice(
     running: Callable[..., Running], here: Run, tmp_path: Path
 ) -> None:
@@ -467,6 +469,7 @@ def nothing_left(drive: Running) -> None:
         os.killpg(drive.process.pid, 0)  # nobody is left in its session
 
 
+@real_time
 @pytest.mark.parametrize("library", ["_pydantic_core", "numpy/_core/_multiarray_umath", "pybullet"])
 def test_ctrl_c_during_start_up_is_one_line(running: Callable[..., Running], library: str) -> None:
     drive = running("start", "--pace", 1)
@@ -479,6 +482,7 @@ def test_ctrl_c_during_start_up_is_one_line(running: Callable[..., Running], lib
     nothing_left(drive)
 
 
+@real_time
 def test_ctrl_c_as_the_store_appears_is_one_line(running: Callable[..., Running]) -> None:
     drive = running("appear", "--pace", 1)
     drive.until(segment(drive.name).exists)
@@ -488,6 +492,7 @@ def test_ctrl_c_as_the_store_appears_is_one_line(running: Callable[..., Running]
     nothing_left(drive)
 
 
+@real_time
 @pytest.mark.parametrize(("cycle", "number"), [(1, signal.SIGINT), (33, signal.SIGTERM), (150, signal.SIGINT)])
 def test_ctrl_c_in_mid_drive_is_one_line_and_keeps_the_recording(
     running: Callable[..., Running], cycle: int, number: int
@@ -507,6 +512,7 @@ def test_ctrl_c_in_mid_drive_is_one_line_and_keeps_the_recording(
     nothing_left(drive)
 
 
+@real_time
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_drive_that_waits_for_a_script_leaves_nothing_when_it_is_ended(
     running: Callable[..., Running], tmp_path: Path, number: int
@@ -520,6 +526,7 @@ def test_a_drive_that_waits_for_a_script_leaves_nothing_when_it_is_ended(
     assert not (tmp_path / "files").exists()
 
 
+@real_time
 def test_a_drive_whose_script_looks_around_first_ends_when_it_is_asked_to(
     running: Callable[..., Running], tmp_path: Path
 ) -> None:
@@ -536,6 +543,7 @@ def test_a_drive_whose_script_looks_around_first_ends_when_it_is_asked_to(
     nothing_left(drive)
 
 
+@real_time
 def test_ctrl_c_ends_the_processes_of_a_shuffled_drive(running: Callable[..., Running]) -> None:
     drive = running("shuffled", "--pace", 2, "--shuffle", 3)
     drive.until_cycle(30)
@@ -548,6 +556,7 @@ def test_ctrl_c_ends_the_processes_of_a_shuffled_drive(running: Callable[..., Ru
     nothing_left(drive)
 
 
+@real_time
 def test_old_verdict_does_not_stand_beside_the_recording_of_an_interrupted_drive(
     running: Callable[..., Running],
 ) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from steady import real_time
 
 from autonomy import ModuleError
 from autonomy.wiring import load_stack
@@ -247,6 +248,7 @@ def attach(name: str, process: "subprocess.Popen[str]") -> Store:
                 pytest.fail(f"it ended: {process.communicate()}")
 
 
+@real_time
 def test_recording_of_a_killed_drive_is_readable_up_to_its_last_second(tmp_path: Path) -> None:
     name = name_of("killed")
     command = [sys.executable, "-m", "scenarios.cli", "drive", "parking-lot/square", "--level", "direct"]
