@@ -3,8 +3,8 @@
 A revision is whole: truncation, writes and close make one. If a piece of a long write is refused, none of it shows. A
 file that is kept open and written anew from offset 0 gets a revision each time, without a tail of the one before. When
 such a one is finished can be seen in a JSON file: when it is JSON. Elsewhere it shows in the next beginning, in fsync
-or the close, or as the file is left alone for a whole cycle; while revisions are one write each, in the end of that
-write. Appended writes are revisions, each one.
+or the close; while revisions are one write each, in the end of that write. What only patches a file is finished when it
+is left alone for a whole cycle. Appended writes are revisions, each one.
 """
 
 import contextlib
@@ -134,6 +134,11 @@ class Draft:
         file open to write it again and again, or who says by fsync what is whole."""
         return self.truncated and (self._synced or not self._kept)
 
+    @property
+    def _rewrites_in_parts(self) -> bool:
+        """Whether revisions are several writes each, and only the beginning of the next tells that one is whole."""
+        return self._kept and not self._single and self._is_whole(b"") is None
+
     def _end_before(self) -> None:
         """A new revision begins: the one before is finished. What was wrong with it is not the new one's fault."""
         if self._ended or self._data:  # an empty revision says nothing about how its user writes
@@ -163,11 +168,16 @@ class Draft:
         self.finish()
 
     def edge(self) -> None:
-        """Note an edge: what was begun without a truncation, and left alone for a whole cycle, counts as finished."""
-        if self.dirty and not self._waits_for_close:
-            if self.idle or self._tail:
-                self.finish()
-            self.idle = True
+        """Note an edge: what was appended is finished, and what patches a file and was left alone for a whole cycle.
+
+        Nothing is in the middle of a write, nor in a file that is written again and again, however long the next piece
+        takes: the machine may be slow.
+        """
+        if not self.dirty or self.is_under_way or self._waits_for_close:
+            return
+        if self._tail or (self.idle and not self._rewrites_in_parts):
+            self.finish()
+        self.idle = True
 
     @property
     def n_bytes(self) -> int:

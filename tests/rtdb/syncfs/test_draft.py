@@ -105,20 +105,63 @@ def test_a_file_kept_open_and_rewritten_commits_whole_documents_in_their_order(d
 
 @given(
     documents=st.lists(st.integers(1, 30), min_size=1, max_size=8),
-    edges=st.lists(st.booleans(), max_size=70),
+    edges=st.lists(st.integers(0, 3), max_size=70),
 )
 def test_a_file_kept_open_is_not_committed_in_the_middle_of_a_document(documents, edges):
-    """An edge may come between any two pieces, but no writer rests for a whole cycle in a document."""
+    """However long its writer rests between the pieces of one write."""
     one, commits = draft()
     texts, left = [bytes([65 + k]) * size for k, size in enumerate(documents)], list(edges)
     for text in texts:
         for at in range(0, len(text), PIECE):
             one.write(at, text[at : at + PIECE])
-            if left and left.pop():
+            for _ in range(left.pop() if left else 0):
                 one.edge()
     one.finish()
     assert set(commits) <= set(texts)
     assert commits[-1] == texts[-1]
+
+
+@given(
+    documents=st.lists(st.lists(st.integers(1, PIECE - 1), min_size=2, max_size=5), min_size=3, max_size=6),
+    edges=st.lists(st.integers(0, 3), min_size=30, max_size=30),
+)
+def test_a_file_that_is_rewritten_in_several_writes_shows_no_part_of_a_document(documents, edges):
+    """The beginning of each ends the one before, and the close the last, however long its writer rests between writes."""
+    one, commits = draft()
+    one.truncate(0)
+    texts = [bytes([65 + k]) * sum(sizes) for k, sizes in enumerate(documents)]
+    for text, sizes in zip(texts, documents, strict=True):
+        at = 0
+        for size in sizes:
+            one.write(at, text[at : at + size])
+            at += size
+            for _ in range(edges.pop()):
+                one.edge()
+    one.finish()
+    assert commits == texts
+
+
+@given(appended=st.lists(st.tuples(st.integers(1, 9), st.integers(0, 3)), min_size=1, max_size=4))
+def test_of_a_long_write_that_appends_no_part_is_committed(appended):
+    one, commits = draft(b"", append=True)
+    ends = [sum(size for size, _ in appended[: k + 1]) for k in range(len(appended))]
+    for size, n_edges in appended:
+        for at in range(0, size, PIECE):
+            one.write(0, b"x" * min(PIECE, size - at))
+            for _ in range(n_edges):
+                one.edge()
+    one.finish()
+    assert {len(commit) for commit in commits} <= set(ends)
+    assert len(commits[-1]) == ends[-1]
+
+
+def test_what_is_patched_shows_when_it_was_left_alone_for_a_cycle():
+    one, commits = draft()
+    one.write(1, b"ol")
+    one.edge()
+    assert commits == []
+    one.edge()
+    assert commits == [b"bole"]
 
 
 @given(base=st.binary(max_size=5), steps=st.lists(st.tuples(st.integers(0, 60), pieces, st.booleans()), max_size=6))
