@@ -126,7 +126,7 @@ def test_a_file_kept_open_is_not_committed_in_the_middle_of_a_document(documents
     edges=st.lists(st.integers(0, 3), min_size=30, max_size=30),
 )
 def test_a_file_that_is_rewritten_in_several_writes_shows_no_part_of_a_document(documents, edges):
-    """The beginning of each ends the one before, and the close the last, however long its writer rests between writes."""
+    """Each beginning ends the one before, and the close the last, however long its writer rests between two writes."""
     one, commits = draft()
     one.truncate(0)
     texts = [bytes([65 + k]) * sum(sizes) for k, sizes in enumerate(documents)]
