@@ -134,11 +134,6 @@ class Draft:
         file open to write it again and again, or who says by fsync what is whole."""
         return self.truncated and (self._synced or not self._kept)
 
-    @property
-    def _rewrites_in_parts(self) -> bool:
-        """Whether revisions are several writes each, and only the beginning of the next tells that one is whole."""
-        return self._kept and not self._single and self._is_whole(b"") is None
-
     def _end_before(self) -> None:
         """A new revision begins: the one before is finished. What was wrong with it is not the new one's fault."""
         if self._ended or self._data:  # an empty revision says nothing about how its user writes
@@ -175,7 +170,8 @@ class Draft:
         """
         if not self.dirty or self.is_under_way or self._waits_for_close:
             return
-        if self._tail or (self.idle and not self._rewrites_in_parts):
+        rewritten = self._kept and self._is_whole(b"") is None  # only the next beginning tells that this one is whole
+        if self._tail or (self.idle and not rewritten):
             self.finish()
         self.idle = True
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtdb.syncfs import FsError
-from rtdb.syncfs.draft import Draft
+from rtdb.syncfs.draft import SHOWN_AT_ONCE_BYTES, Draft
 
 PIECE, MOST = 4, 40
 
@@ -153,6 +153,17 @@ def test_of_a_long_write_that_appends_no_part_is_committed(appended):
     one.finish()
     assert {len(commit) for commit in commits} <= set(ends)
     assert len(commits[-1]) == ends[-1]
+
+
+def test_a_large_file_that_is_appended_to_without_a_pause_shows_at_each_edge():
+    commits = [bytes(SHOWN_AT_ONCE_BYTES)]
+    one = Draft(lambda: commits[-1], commits.append, append=True, most_bytes=1 << 20, piece_bytes=PIECE)
+    for n in (1, 2, 3):
+        one.write(0, b"x")
+        one.write(0, b"y")
+        assert len(commits) == n
+        one.edge()
+        assert commits[-1].endswith(b"xy" * n)
 
 
 def test_what_is_patched_shows_when_it_was_left_alone_for_a_cycle():

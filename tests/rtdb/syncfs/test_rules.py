@@ -508,6 +508,16 @@ def test_invalid_json_is_not_committed_and_the_last_good_status_stays(seated):
         assert json.loads(reader.read("follow/status")) == {"speed_mps": 1.5}
 
 
+def test_invalid_json_in_a_status_that_is_kept_open_shows_in_the_health_when_it_was_left_alone(seated):
+    script, reader = seated.client(token="token-of-follow"), seated.client()
+    fid = script.open("follow/status", O_WRONLY)
+    script.pwrite(fid, b'{"speed_mps": 1.5}')
+    script.pwrite(fid, b'{"speed_mps": ')
+    seated.edge(3)
+    assert json.loads(reader.read("follow/status")) == {"speed_mps": 1.5}
+    assert "refused" in reader.json("follow/health")["status"]
+
+
 def test_invalid_json_shows_in_the_components_health_and_in_the_servers_count(seated):
     script, reader = seated.client(token="token-of-follow"), seated.client()
     script.write("follow/status", b'{"speed_mps": 1.5}')
